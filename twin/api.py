@@ -20,22 +20,22 @@ from pathlib import Path
 from table_io.clock import RealClock
 from table_io.config.folders import resolve_config
 from table_io.errors import InputError
+from twin.discovery.discover import discover_effects
+from twin.discovery.identify import identify_parameters
+from twin.discovery.loading import load_logs, load_recordings
+from twin.discovery.parameters import get_log
+from twin.discovery.serialize import model_to_toml, parameter_to_json, verdict_to_json
 from twin.exchange.import_table import ImportOptions, import_samples
-from twin.identification.discover import discover_effects
-from twin.identification.identify import identify_parameters
-from twin.identification.parameters import get_log
 from twin.log import Log, open_log
 from twin.model.effects import find_effect
 from twin.replay.pipeline_replay import RecordedRun, SampleRange, replay_recording
-from twin.reports.contracts import Interval, Verdict
-from twin.reports.discovery.loading import load_logs, load_recordings
-from twin.reports.discovery.serialize import model_to_toml, parameter_to_json, verdict_to_json
-from twin.reports.summary import dump_contract
-from twin.run.folders import make_run_folder
-from twin.run.recordings import read_recorded_config
-from twin.run.run_config import read_model_template, read_run_config
-from twin.run.unpaced import play_unpaced, simulate_ideal
-from twin.run.warm_up import compile_kernels
+from twin.results.contracts import Interval, Verdict
+from twin.results.recordings import read_recorded_config
+from twin.results.summary import dump_contract
+from twin.setup.folders import make_run_folder
+from twin.setup.run_config import read_model_template, read_run_config
+from twin.setup.unpaced import play_unpaced, simulate_ideal
+from twin.setup.warm_up import compile_kernels
 from twin.studies.maps.results import open_study
 
 __all__ = [

@@ -8,7 +8,7 @@ import pytest
 from tests.input_errors import raises_input_error
 from twin import api
 from twin.model.config import ModelConfig
-from twin.run.run_config import RunConfig, read_model
+from twin.setup.run_config import RunConfig, read_model
 
 
 @pytest.fixture

@@ -16,9 +16,9 @@ from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.run.system import count_cores
-from twin.run.tasks import Workers, run_tasks
 from twin.studies.cases import make_gap_variants
+from twin.system.files import count_cores
+from twin.system.process_pool import Workers, run_tasks
 
 AG, FREQUENCY, CYCLES, RATE = 0.05 * 9.80665, 3.4, 10, 2000.0
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)

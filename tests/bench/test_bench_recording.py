@@ -23,8 +23,8 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, RunStart
 from twin.recording.mcap_log import LogWriter
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import add_twin_items
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import add_twin_items
 from twin.transport.codec import Item, encode_item, topic_for
 
 FLUSH_BLOCKS = 15

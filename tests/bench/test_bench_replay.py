@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 from table_io.config.folders import find_config
 from twin.log import open_log
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
-from twin.run.run_config import RunConfig, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 from twin.transport import shaketwin_pb2 as pb
 
 LEAST_TIMES_REAL_TIME = 20  # far below what was measured; the ratios are judged by ratios.py

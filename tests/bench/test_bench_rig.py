@@ -14,7 +14,7 @@ from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from twin.compare import TWIN_CHANNELS, pipeline
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, read_run_config
 from twin.transport.codec import decode_item, encode_item, topic_for
 
 

@@ -10,7 +10,7 @@ import pytest
 
 if TYPE_CHECKING:
     from twin.recording.reader import Recording
-    from twin.run.run_config import RunConfig
+    from twin.setup.run_config import RunConfig
 
 PROFILE = """
 title = "Across the down-jump and back"
@@ -35,7 +35,7 @@ predictions = "all"
 @pytest.fixture(scope="session")
 def bundle(tmp_path_factory: pytest.TempPathFactory) -> "RunConfig":
     """Six steps across the down-jump and back."""
-    from twin.run.run_config import read_run_config
+    from twin.setup.run_config import read_run_config
 
     path = tmp_path_factory.mktemp("across") / "across.toml"
     path.write_text(PROFILE)
@@ -45,7 +45,7 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> "RunConfig":
 @pytest.fixture(scope="session")
 def log_file(bundle: "RunConfig", tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The recording of a run of it, alone in its folder."""
-    from twin.run.unpaced import play_unpaced
+    from twin.setup.unpaced import play_unpaced
 
     path = tmp_path_factory.mktemp("across") / "first" / "run.mcap"
     path.parent.mkdir()

@@ -32,7 +32,7 @@ from twin.campaign.state import (
     require_unchanged,
     write_state,
 )
-from twin.run.run_config import RunConfig
+from twin.setup.run_config import RunConfig
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from table_io.errors import InputError
 from tests.campaign.campaigns import write
 from tests.input_errors import raises_input_error
 from twin.campaign.config import CampaignPlan, list_campaign_warnings, read_plan
-from twin.run.run_config import RunConfig
+from twin.setup.run_config import RunConfig
 
 
 def anything(_: RunConfig, __: Path) -> None:

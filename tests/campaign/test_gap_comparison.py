@@ -35,9 +35,9 @@ from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import LARGER, SMALLER, list_gap_tables, list_gap_values
 from twin.campaign.summary import read_campaign
 from twin.cli.simulate import simulate_profile
+from twin.drawing.page import render_page
 from twin.recording.reader import read_recording
-from twin.reports.page import render_page
-from twin.run.run_config import RunConfig
+from twin.setup.run_config import RunConfig
 
 Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665

@@ -20,10 +20,10 @@ from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.figures import prc_families
 from twin.campaign.summary import read_campaign
 from twin.cli import report as reading
+from twin.drawing.prc_families import draw_all_gaps
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
-from twin.reports.prc_families import draw_all_gaps
-from twin.run.unpaced import play_unpaced
+from twin.setup.unpaced import play_unpaced
 
 pytestmark = pytest.mark.slow  # 30 s
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")

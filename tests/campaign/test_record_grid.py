@@ -16,7 +16,7 @@ from tests.campaign.campaigns import Players, make_options, prepare_campaign
 from tests.input_errors import raises_input_error
 from twin.campaign.command import run_campaign
 from twin.campaign.config import CampaignPlan, list_campaign_warnings, read_plan
-from twin.run.run_config import RunConfig, from_texts
+from twin.setup.run_config import RunConfig, from_texts
 
 BASE = """
 title = "base"

@@ -9,7 +9,7 @@ import pytest
 
 from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
-from twin.cli.branches import BranchRequest, show_branches
+from twin.branches.command import BranchRequest, show_branches
 
 REQUEST = BranchRequest(
     Path("quickstart"), None, None, None, "frequency", None, None, None, False, False, None, None

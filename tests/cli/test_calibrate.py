@@ -22,9 +22,9 @@ from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.input_errors import raises_input_error
-from twin.cli import calibrate as command
 from twin.cli.main import app
-from twin.run.run_config import read_run_config
+from twin.rig import calibrate as command
+from twin.setup.run_config import read_run_config
 
 TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 LASER = 'channel = "table_disp_m"\nunit = "mm"\n'

@@ -14,10 +14,10 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
-from twin.cli.check import find_worst_rows, print_plan, select_rows, sum_durations_s
-from twin.reports.drive_figure import draw_drive
-from twin.reports.predicted_ranges import format_clipping_warnings, predict_response
-from twin.run.run_config import RunConfig, from_texts, read_run_config
+from twin.rig.check import find_worst_rows, print_plan, select_rows, sum_durations_s
+from twin.rig.drive_figure import draw_drive
+from twin.rig.predicted_ranges import format_clipping_warnings, predict_response
+from twin.setup.run_config import RunConfig, from_texts, read_run_config
 
 RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
 SNM = (PROFILES_DIR / "models" / "snm.toml").read_text()

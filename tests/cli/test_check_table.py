@@ -21,8 +21,8 @@ from table_io.config.rig import RigConfig
 from table_io.sim.machine.flight_recorder import read_flight_record
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.input_errors import raises_input_error
-from twin.cli.check_table import WiringCheckResult, examine_wiring
 from twin.cli.main import app
+from twin.rig.check_table import WiringCheckResult, examine_wiring
 
 TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 RIG = parse_toml(TEXT, RigConfig, "simulated")

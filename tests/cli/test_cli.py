@@ -175,7 +175,7 @@ def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> N
     ("module", "slow"),
     [
         ("twin.cli.main", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
-        ("twin.cli.reference", "numba scipy matplotlib zenoh"),
+        ("twin.guide.reference_command", "numba scipy matplotlib zenoh"),
         ("twin.live.control", "typer numpy numba pydantic rich google.protobuf ssl"),
     ],
 )
@@ -195,7 +195,7 @@ def test_only_a_report_imports_what_draws_and_scipy_signal_is_for_discovery() ->
     code = (
         "import sys; slow = {'matplotlib', 'scipy.signal'}; "
         "import twin.cli.report; print(sorted(slow & set(sys.modules))); "
-        "import twin.reports.report; print(sorted(slow & set(sys.modules)))"
+        "import twin.report.report; print(sorted(slow & set(sys.modules)))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

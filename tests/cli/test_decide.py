@@ -13,16 +13,18 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from twin.cli import decide, discover
-from twin.cli.decide import DecideOptions, parse_options, play_decisive_tests
-from twin.cli.discover import judge_logs
+from twin.discovery import decide_command as decide
+from twin.discovery import decisive_test
+from twin.discovery import discover_command as discover
+from twin.discovery.decide_command import DecideOptions, parse_options, play_decisive_tests
+from twin.discovery.discover_command import judge_logs
+from twin.discovery.serialize import Json
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
-from twin.reports.discovery.serialize import Json
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run import decisive_test, terminal
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import play_unpaced
+from twin.system import terminal
 
 PROFILE = """
 title = "one frequency"

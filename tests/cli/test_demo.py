@@ -12,7 +12,7 @@ from table_io.errors import InputError
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.simulated_table import load_ground_truth
 from tests.command_line import call_main
-from twin.cli.demo import (
+from twin.demo.command import (
     HIDEABLE_EFFECTS,
     RIG_FILE,
     SEALED_FILE,

@@ -16,21 +16,21 @@ from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.records import SampleGap
 from tests.input_errors import raises_input_error
-from twin.cli import discover
-from twin.cli.discover import judge_logs
-from twin.cli.identify import identify_command
+from twin.discovery import discover_command as discover
+from twin.discovery.discover import Discovery, prepare_problem
+from twin.discovery.discover_command import judge_logs
+from twin.discovery.free_running import run_log_free
+from twin.discovery.headline import format_verdict
+from twin.discovery.identify_command import identify_command
+from twin.discovery.loading import load_logs
+from twin.discovery.selection import Cancelled
+from twin.discovery.serialize import REFITTED_SUFFIX
 from twin.exchange.import_table import import_samples
-from twin.identification.discover import Discovery, prepare_problem
-from twin.identification.selection import Cancelled
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
-from twin.reports.discovery.free_running import run_log_free
-from twin.reports.discovery.headline import format_verdict
-from twin.reports.discovery.loading import load_logs
-from twin.reports.discovery.serialize import REFITTED_SUFFIX
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.run_config import read_model_template, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.run_config import read_model_template, read_run_config
+from twin.setup.unpaced import play_unpaced
 
 PROFILE = """
 title = "short"

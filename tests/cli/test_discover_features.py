@@ -9,7 +9,7 @@ from table_io.config.base import load_config
 from tests.command_line import call_main
 from twin.model.config import ModelConfig
 from twin.model.effects import EFFECTS
-from twin.reports.contracts import FeatureVerdict
+from twin.results.contracts import FeatureVerdict
 
 FEATURES = """title = "Two peaks"
 [specimen]

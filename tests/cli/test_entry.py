@@ -9,10 +9,11 @@ from twin.cli import entry
 from twin.cli.live_commands import RunCommand
 from twin.cli.main import announce_first_start
 from twin.live import control
+from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 SENT = [
-    ("control stop", ("stop", "", entry.DEFAULT_ENDPOINT, "simulated")),
-    ("control hold --why tired --rig big", ("hold", "tired", entry.DEFAULT_ENDPOINT, "big")),
+    ("control stop", ("stop", "", DEFAULT_ENDPOINT, "simulated")),
+    ("control hold --why tired --rig big", ("hold", "tired", DEFAULT_ENDPOINT, "big")),
     ("control abort --connect tcp/[::1]:9", ("abort", "", "tcp/[::1]:9", "simulated")),
 ]
 PARSED = ["", "run stop", "control", "control --help", "control stop --why", "control sotp",

@@ -6,7 +6,7 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.studies.hostile_files import Trials, call_command, watch
-from twin.run.run_config import from_texts
+from twin.setup.run_config import from_texts
 
 COMMANDS = {"verify", "prc", "replay", "import"}
 
@@ -34,7 +34,7 @@ def test_a_hostile_file_is_refused_or_read(
 
 
 def test_a_crash_would_be_seen(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.cli.verify.examine_logs", lambda paths, _: paths[7])
+    monkeypatch.setattr("twin.replay.verify.examine_logs", lambda paths, _: paths[7])
     code, error = call_command(("verify", trials.folder / "whole.mcap"), report=False)
     assert code == "crashed"
     assert "IndexError" in error

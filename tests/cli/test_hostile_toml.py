@@ -13,7 +13,7 @@ import pytest
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from twin.campaign.config import read_plan
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 
 # Short ones, of every kind of excitation and backend.
 FILES = {

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from table_io.config.base import PROFILES_DIR
 from tests.command_line import call_main
-from twin.run.terminal import SafeConsole
+from twin.system.terminal import SafeConsole
 
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
 

@@ -19,8 +19,8 @@ from table_io.config.profile import Profile
 from tests.command_line import call_main
 from twin.cli.examples import EXAMPLES
 from twin.cli.main import app
-from twin.cli.reference import build_file_schema
 from twin.cli.reference_commands import FileKind
+from twin.guide.reference_command import build_file_schema
 from twin.model.effects import EFFECTS
 
 KEY = re.compile(r"(# )?\w+ = ")  # at the start of a line, perhaps commented out

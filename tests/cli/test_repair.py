@@ -8,9 +8,9 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.recording.test_mcap_log import run, write
-from twin.cli import repair
-from twin.cli.repair import write_repaired
-from twin.cli.verify import Verification, examine_logs
+from twin.replay import repair
+from twin.replay.repair import write_repaired
+from twin.replay.verify import Verification, examine_logs
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import read_flight_record
 from tests.input_errors import raises_input_error
-from twin.cli.run import run_test
-from twin.cli.table import serve_table
+from twin.live.run_command import run_test
+from twin.rig.table import serve_table
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 CARD = (PROFILES_DIR / "rigs" / "machine.toml").read_text()

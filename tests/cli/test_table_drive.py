@@ -15,11 +15,11 @@ from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
 from tests.command_line import call_main
-from twin.cli import table_drive
-from twin.drive.table_file import load_table_twin
-from twin.drive.table_model import TableParameters
+from twin.earthquakes import command as table_drive
+from twin.earthquakes.table_file import load_table_twin
+from twin.earthquakes.table_model import TableParameters
 from twin.recording.reader import read_recording
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 
 RECORD = """
 title = "Short pulse"

@@ -24,13 +24,13 @@ from tests.cli.test_cli import SHORT
 from tests.exchange.mutants import damage, spans, whole
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
-from twin.cli.verify import examine_logs
 from twin.recording.mcap_log import LogWriter, write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.recovery import ATTACHMENT, CHUNK, recover_log
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import add_twin_items
+from twin.replay.verify import examine_logs
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import add_twin_items
 from twin.transport.codec import encode_item, topic_for
 
 

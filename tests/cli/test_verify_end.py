@@ -11,11 +11,11 @@ from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
 from tests.recording.example_run import BLOCK_SAMPLES, START, block, run, write
 from twin.cli.main import app
-from twin.cli.verify import find_missing_end
 from twin.exchange.export import export_log
 from twin.log import open_log
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import PARTS_FOLDER, resolve_log_path
+from twin.replay.verify import find_missing_end
 
 PLANNED = START.planned_samples
 

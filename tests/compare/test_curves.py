@@ -17,7 +17,7 @@ from twin.compare.curves import (
 )
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.reports.paper_cases import load_paper_cases
+from twin.results.paper_cases import load_paper_cases
 
 GRID = tuple(round(2.0 + 0.1 * k, 9) for k in range(21))
 LEVEL = 0.05 * 9.80665

@@ -44,7 +44,7 @@ from twin.dynamics.continuation import continue_branch
 from twin.dynamics.orbits import settle_to_orbit
 from twin.dynamics.period_map import make_period_map
 from twin.model.ideal_response import simulate_sweep
-from twin.run.run_config import RunConfig, from_texts
+from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import encode_item
 
 # Slow enough for many cycles of contact, short enough for a test; no loop check, no tuning.

@@ -27,7 +27,7 @@ from table_io.records import (
     StepAdded,
 )
 from twin.compare import pipeline
-from twin.run.run_config import RunConfig, from_texts
+from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import Item, encode_item
 
 PROFILE = """

@@ -19,7 +19,7 @@ from twin.dynamics.resonance_map import (
 )
 from twin.model.model import Model
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 
 LEVEL_M_S2 = 0.05 * GRAVITY_M_S2
 LIMITS_HZ = (1.8, 6.0)

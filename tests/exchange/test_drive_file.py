@@ -13,9 +13,9 @@ from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.config.folders import find_config
 from tests.input_errors import raises_input_error
-from twin.cli.table import ExternalController, serve_table
 from twin.exchange.drive_file import WRITERS, DriveFile, export_drive, read_drive, write_drive
-from twin.run.run_config import read_run_config
+from twin.rig.table import ExternalController, serve_table
+from twin.setup.run_config import read_run_config
 
 PROFILE = """
 title = "short"

@@ -12,13 +12,13 @@ from table_io.records import Comparison, Event, PrcPoint, SampleGap
 from tests.exchange.csv_tables import write_csv
 from tests.input_errors import raises_input_error
 from tests.run.test_unpaced import QUICK, play_run
-from twin.cli.replay import ReplayRequest, replay_logs
 from twin.cli.report import print_recording_prc
 from twin.exchange.export import export_log
 from twin.exchange.import_table import import_samples, print_contents
 from twin.recording.reader import Recording, read_recording
-from twin.reports.summary import summarise
-from twin.run.recordings import read_recorded_config
+from twin.replay.command import ReplayRequest, replay_logs
+from twin.results.recordings import read_recorded_config
+from twin.results.summary import summarise
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 SHORT = QUICK.replace("start_hz = 2.6", "start_hz = 3.6")

@@ -14,7 +14,7 @@ from twin.exchange.formats import SampleTable, make_column
 from twin.exchange.import_table import ImportOptions, import_samples
 from twin.exchange.proposal import MapProposal, propose_map
 from twin.recording.reader import read_recording
-from twin.run.recordings import read_recorded_config
+from twin.results.recordings import read_recorded_config
 
 TIME = np.arange(2000) / 200.0
 U = np.sin(2 * np.pi * 2.0 * TIME)

@@ -12,16 +12,16 @@ from table_io.config.key_reference import derive_unit, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from twin.cli.main import app
+from twin.discovery.features.config import FeatureSet
+from twin.discovery.features.prediction import describe_feature
 from twin.guide.gallery import write_gallery
 from twin.guide.loops import compute_loops, find_loops
 from twin.guide.notebook import convert_notebook, list_code
 from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
-from twin.identification.features.config import FeatureSet
-from twin.identification.features.prediction import describe_feature
 from twin.model.effects import EFFECTS
 from twin.model.effects.effect import Effect
-from twin.reports.contracts import FeatureVerdict
+from twin.results.contracts import FeatureVerdict
 
 
 def test_every_key_of_every_file_has_a_meaning() -> None:

@@ -181,7 +181,7 @@ def test_the_command_writes_the_site(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_the_guide_imports_no_kernels() -> None:
     """They would be compiled first, for a minute."""
     program = (
-        "import sys, twin.guide.site, twin.cli.guide;"
+        "import sys, twin.guide.site, twin.guide.command;"
         "print([name for name in sys.modules if name.startswith('twin') and 'kernel' in name])"
     )
     result = subprocess.run(

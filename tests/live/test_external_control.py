@@ -17,9 +17,9 @@ from table_io.records import RunStart, Timing
 from table_io.sim.opendaq import OpenDaqServer
 from tests.input_errors import raises_input_error
 from twin.live.twin_process import TwinProcess
-from twin.reports.summary import summarise_timing
-from twin.run.disk import bytes_per_s, planned_bytes
-from twin.run.run_config import compile_rig_kernels, read_run_config
+from twin.results.summary import summarise_timing
+from twin.setup.disk import bytes_per_s, planned_bytes
+from twin.setup.run_config import compile_rig_kernels, read_run_config
 
 SPARE = "drive_disp_m"
 

@@ -23,8 +23,8 @@ from twin.live.gateway import (
     validate_command,
 )
 from twin.live.process_config import ProcessConfig, process_token
-from twin.run.run_config import read_run_config
-from twin.run.temporary_folders import SOCKET_PREFIX, make_private_folder
+from twin.setup.run_config import read_run_config
+from twin.system.temporary_folders import SOCKET_PREFIX, make_private_folder
 from twin.transport.codec import TOPIC_TYPES, decode_item, encode_item
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, MEAS_TOPIC, key_expression, list_runs
 from twin.transport.reliable_subscriber import ReliableSubscriber

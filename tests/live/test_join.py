@@ -17,9 +17,9 @@ from tests.live.test_live import endpoint
 from twin.live import join
 from twin.live.join import join_as_recorder
 from twin.recording.recovery import recover_log
-from twin.reports.finalize import EXIT_GAPS, EXIT_INTERRUPTED
-from twin.run.run_config import read_run_config
+from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.security.access_control import build_open_access
+from twin.setup.run_config import read_run_config
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, merge_settings
 from twin.transport.reliable_subscriber import ReliableSubscriber

@@ -17,7 +17,7 @@ import pytest
 from table_io.records import Comparison, Fault
 from tests.command_line import call_main
 from twin.recording.reader import Recording, read_recording
-from twin.run.diagnostics import LEVEL_VARIABLE
+from twin.system.diagnostics import LEVEL_VARIABLE
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 PROFILE = """

@@ -22,7 +22,7 @@ from twin.live.recorder import CompletionTracker, Recorder
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
 from twin.recording.reader import read_recording
-from twin.run.disk import DiskForecast, DiskReserve
+from twin.setup.disk import DiskForecast, DiskReserve
 from twin.transport.codec import Item, encode_item, topic_for
 
 START = start_record()

@@ -13,9 +13,9 @@ import pytest
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
 from tests.input_errors import raises_input_error
-from twin.cli.replay import ReplayRequest, replay_logs
 from twin.live import replay_publishing
 from twin.recording.recovery import recover_log
+from twin.replay.command import ReplayRequest, replay_logs
 from twin.transport import history_cache
 from twin.transport.codec import TOPIC_TYPES, decode_item
 from twin.transport.zenoh_link import open_hub, open_spoke
@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def endpoint(monkeypatch: pytest.MonkeyPatch) -> str:
     """A free one; and no report is drawn."""
-    monkeypatch.setattr("twin.cli.replay.finalize_run", lambda *_: 0)
+    monkeypatch.setattr("twin.replay.command.finalize_run", lambda *_: 0)
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"

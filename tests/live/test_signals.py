@@ -19,7 +19,7 @@ from tests.live.test_live import (
     start,
 )
 from twin.recording.reader import read_recording
-from twin.run.terminal import STOP_SIGNALS, catch_interrupts
+from twin.system.terminal import STOP_SIGNALS, catch_interrupts
 
 PAUSE_S = 7.0  # longer than the supervisor waits for a silent rig
 

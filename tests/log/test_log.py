@@ -16,7 +16,7 @@ from tests.input_errors import raises_input_error
 from twin.log import ChannelMap, Log, open_log
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.run.run_config import RunConfig
+from twin.setup.run_config import RunConfig
 
 
 @pytest.fixture(scope="module")

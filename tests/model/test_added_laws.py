@@ -12,17 +12,17 @@ from scipy.optimize import brentq
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
-from tests.identification.played import SNM, format_truth, log
+from tests.discovery.played import SNM, format_truth, log
 from tests.model import laboratory_laws
 from tests.model.cases import RATE_HZ, drive, noisy, typical
 from tests.model.independent_solution import Witness
 from tests.model.motion import sine
 from tests.model.reference import snm
 from tests.plugin_package import install_package
+from twin.discovery.discover import discover_effects
+from twin.discovery.parameters import EffectKey
 from twin.dynamics.period_map import make_period_map
 from twin.dynamics.stroboscopic import OperatingPoint, make_stroboscopic_map
-from twin.identification.discover import discover_effects
-from twin.identification.parameters import EffectKey
 from twin.model.effects import find_effect, load_plugins
 from twin.model.effects.effect import Effect
 from twin.model.effects.effect_file import EffectFile

@@ -9,7 +9,7 @@ import pytest
 from table_io.compilation import jit_helper
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
-from tests.identification.played import SNM
+from tests.discovery.played import SNM
 from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.effects.effect_file import EffectFile, build_written_effect

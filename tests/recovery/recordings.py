@@ -14,8 +14,8 @@ from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_sweep
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.simulated_table import SimulatedBackend
-from twin.identification.discover import PreparedLog
-from twin.identification.signals import build_signals
+from twin.discovery.discover import PreparedLog
+from twin.discovery.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from table_io.block import Block, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from twin.identification.discover import PreparedLog
-from twin.identification.signals import build_signals
+from twin.discovery.discover import PreparedLog
+from twin.discovery.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 

@@ -8,11 +8,11 @@ import pytest
 
 from table_io.errors import InputError
 from tests.recovery.recordings import FAR, TRUTH, make_noisy_blocks, prepare_log
-from twin.identification.cross_checks import fitted_gap
-from twin.identification.discover import prepare_problem
-from twin.identification.identify import IdentificationResult, correct_bias, identify_parameters
-from twin.identification.least_squares import FitResult, fit_parameters
-from twin.identification.parameters import (
+from twin.discovery.cross_checks import fitted_gap
+from twin.discovery.discover import prepare_problem
+from twin.discovery.identify import IdentificationResult, correct_bias, identify_parameters
+from twin.discovery.least_squares import FitResult, fit_parameters
+from twin.discovery.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
     DAMPING,

@@ -15,8 +15,8 @@ from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
 from twin.cli.main import app
 from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
-from twin.reports.quantities import format_quantity
-from twin.run.run_config import from_texts, read_model
+from twin.results.quantities import format_quantity
+from twin.setup.run_config import from_texts, read_model
 
 GAPS = (2.0, 2.0)
 

@@ -10,9 +10,9 @@ import pytest
 from scipy.signal import resample_poly
 
 from tests.recovery.recordings import log_columns, oscillator
-from twin.identification.discover import PreparedLog, discover_effects
-from twin.identification.held_out import compute_force_error
-from twin.identification.parameters import INPUT_GAIN, INPUT_OFFSET
+from twin.discovery.discover import PreparedLog, discover_effects
+from twin.discovery.held_out import compute_force_error
+from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
 from twin.model.model import Model
 
 DATA = Path(__file__).parents[3] / "shared" / "data"

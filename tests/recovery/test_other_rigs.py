@@ -19,15 +19,15 @@ from tests.recovery.scaled_specimens import (
     record_block,
     start_model,
 )
-from twin.identification.discover import PreparedLog, discover_effects
-from twin.identification.identify import IdentificationResult, identify_parameters
-from twin.identification.parameters import (
+from twin.discovery.discover import PreparedLog, discover_effects
+from twin.discovery.identify import IdentificationResult, identify_parameters
+from twin.discovery.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
     DAMPING,
     STIFFNESS,
 )
-from twin.identification.signals import has_single_frequency
+from twin.discovery.signals import has_single_frequency
 from twin.model.model import Model
 
 TWO_BUMPERS = Hidden(gap=GAP)

@@ -16,11 +16,11 @@ from tests.recovery.scaled_specimens import (
     record_block,
     start_model,
 )
-from twin.cli.identify import identification_to_json
-from twin.identification.discover import Discovery, discover_effects
-from twin.identification.held_out import compute_force_error
-from twin.identification.identify import IdentificationResult, identify_parameters
-from twin.identification.parameters import (
+from twin.discovery.discover import Discovery, discover_effects
+from twin.discovery.held_out import compute_force_error
+from twin.discovery.identify import IdentificationResult, identify_parameters
+from twin.discovery.identify_command import identification_to_json
+from twin.discovery.parameters import (
     DAMPING,
     SLIP_SPEED,
     STIFFNESS,
@@ -28,7 +28,7 @@ from twin.identification.parameters import (
     ParameterKey,
     ParameterSet,
 )
-from twin.reports.discovery.serialize import Json, verdict_to_json
+from twin.discovery.serialize import Json, verdict_to_json
 
 FRICTION = Hidden("coulomb_friction", 120.0)
 CUBIC = Hidden("cubic_stiffness", 3e6)

@@ -6,10 +6,10 @@ from functools import cache
 import pytest
 
 from tests.recovery.scaled_specimens import GAP, C, Hidden, K, record, start_model
-from twin.identification.discover import Discovery, discover_effects
-from twin.identification.parameters import DAMPING, STIFFNESS, EffectKey, GapKey, ParameterKey
+from twin.discovery.discover import Discovery, discover_effects
+from twin.discovery.parameters import DAMPING, STIFFNESS, EffectKey, GapKey, ParameterKey
+from twin.discovery.serialize import model_to_toml
 from twin.model.config import ModelConfig
-from twin.reports.discovery.serialize import model_to_toml
 
 HIDDEN = {
     "nothing": Hidden(),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.recovery.scaled_specimens import C_J, GAP, K_J, C, Hidden, K, record, start_model
-from twin.identification.discover import Discovery, PreparedLog, discover_effects
+from twin.discovery.discover import Discovery, PreparedLog, discover_effects
 from twin.model.model import Model
 
 # both losses are several times that of the dashpot, which takes them up where they are missing

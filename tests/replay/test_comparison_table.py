@@ -12,12 +12,12 @@ import pytest
 
 from table_io.records import Comparison
 from tests.input_errors import raises_input_error
-from twin.cli.replay import ReplayRequest, replay_logs
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports.finalize import EXIT_NOT_IDENTICAL
-from twin.run.run_config import RunConfig, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.replay.command import ReplayRequest, replay_logs
+from twin.report.finalize import EXIT_NOT_IDENTICAL
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 
 
 @pytest.fixture(scope="module")

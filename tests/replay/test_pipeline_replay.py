@@ -23,16 +23,16 @@ from table_io.records import (
 )
 from tests.input_errors import raises_input_error
 from tests.replay.in_memory import recorded_in
-from twin.cli.replay import ReplayRequest, replay_logs
 from twin.compare import pipeline, twins
 from twin.compare.monitoring import EVENT_KINDS
 from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.tabular import parse_step_range
+from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
-from twin.reports.finalize import EXIT_NOT_IDENTICAL
-from twin.run.run_config import RunConfig
+from twin.report.finalize import EXIT_NOT_IDENTICAL
+from twin.setup.run_config import RunConfig
 from twin.transport.codec import Item, encode_item
 
 
@@ -269,7 +269,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         kept.update(extra["replay"])
         return 0
 
-    monkeypatch.setattr("twin.cli.replay.finalize_run", close)
+    monkeypatch.setattr("twin.replay.command.finalize_run", close)
     return kept
 
 

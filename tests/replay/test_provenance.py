@@ -9,14 +9,14 @@ import pytest
 
 from table_io.records import Comparison, Event, Fault, Timing
 from tests.replay.in_memory import recorded_in
-from twin.cli.replay import ReplayRequest, replay_logs
-from twin.cli.verify import examine_logs, verify_logs
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
+from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
-from twin.reports.finalize import EXIT_NOT_IDENTICAL
-from twin.run.run_config import RunConfig
-from twin.run.versions import read_installed_versions
+from twin.replay.verify import examine_logs, verify_logs
+from twin.report.finalize import EXIT_NOT_IDENTICAL
+from twin.setup.run_config import RunConfig
+from twin.system.versions import read_installed_versions
 from twin.transport.codec import Item
 
 
@@ -55,7 +55,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         kept.update(extra["replay"])
         return 0
 
-    monkeypatch.setattr("twin.cli.replay.finalize_run", close)
+    monkeypatch.setattr("twin.replay.command.finalize_run", close)
     return kept
 
 

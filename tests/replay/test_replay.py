@@ -16,9 +16,9 @@ from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import ReplayComparison, replay_recording
-from twin.reports.summary import dump_strict_json, summarise
-from twin.run.run_config import RunConfig, from_texts, read_run_config
-from twin.run.unpaced import simulate_ideal
+from twin.results.summary import dump_strict_json, summarise
+from twin.setup.run_config import RunConfig, from_texts, read_run_config
+from twin.setup.unpaced import simulate_ideal
 from twin.transport.codec import Item, encode_item
 
 

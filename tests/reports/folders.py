@@ -10,11 +10,12 @@ from typing import Any
 import pytest
 
 from tests.reports.recordings import blocks, start_record, summary
+from twin.drawing import plot_style
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports import figures, plot_style
-from twin.reports.report import render_report
-from twin.reports.report_data import build_report_data
+from twin.report import figures
+from twin.report.report import render_report
+from twin.results.report_data import build_report_data
 from twin.transport.codec import Item
 
 Maker = Callable[..., Path]
@@ -26,7 +27,7 @@ import importlib.util, sys
 
 class DraftFinder:
     def find_spec(self, name, path=None, target=None):
-        if name != "twin.reports.plot_style":
+        if name != "twin.drawing.plot_style":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)

@@ -5,11 +5,7 @@ import numpy as np
 import pytest
 
 from tests.model.reference import AG, snm
-from twin.dynamics.basins import StartGrid, compute_basins, compute_basins_over
-from twin.dynamics.brute_force import find_chaotic_bands, follow_attractor, record_section
-from twin.dynamics.stroboscopic import OperatingPoint
-from twin.model.model import Model
-from twin.reports.basin_figures import (
+from twin.drawing.basin_figures import (
     KIND_COLOURS,
     describe_kind,
     draw_basin_fractions,
@@ -17,7 +13,11 @@ from twin.reports.basin_figures import (
     draw_bifurcation_diagram,
     draw_section,
 )
-from twin.reports.plot_style import save_figures
+from twin.drawing.plot_style import save_figures
+from twin.dynamics.basins import StartGrid, compute_basins, compute_basins_over
+from twin.dynamics.brute_force import find_chaotic_bands, follow_attractor, record_section
+from twin.dynamics.stroboscopic import OperatingPoint
+from twin.model.model import Model
 
 POINT = OperatingPoint(Model(snm()), 3.4, AG)
 GRID = StartGrid.from_limits(6e-3, 0.15, 7, 7)

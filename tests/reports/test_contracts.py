@@ -9,15 +9,15 @@ from pydantic import BaseModel, ValidationError
 
 from table_io.records import Check, Fault, NormalizedResponse, Timing, Trip
 from twin.compare.curves import Hysteresis, PrcJump
-from twin.reports import contracts
-from twin.reports.contracts import (
+from twin.results import contracts
+from twin.results.contracts import (
     FeatureVerdict,
     RunSummary,
     SummaryKeys,
     Verdict,
     build_json_schema,
 )
-from twin.reports.summary import dump_contract, dump_strict_json
+from twin.results.summary import dump_contract, dump_strict_json
 
 NAN = float("nan")
 INTERVAL = {"value": 60.0, "low": 58.0, "high": NAN, "unit": "N"}

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import pytest
 
-from tests.identification.played import SNM, log
-from twin.identification.discover import prepare_problem
-from twin.identification.least_squares import FitResult
-from twin.identification.parameters import INPUT_GAIN, INPUT_OFFSET
-from twin.reports.discovery.serialize import model_to_toml
+from tests.discovery.played import SNM, log
+from twin.discovery.discover import prepare_problem
+from twin.discovery.least_squares import FitResult
+from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
+from twin.discovery.serialize import model_to_toml
 
 
 @pytest.fixture(scope="module")

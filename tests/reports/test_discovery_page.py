@@ -12,28 +12,28 @@ from matplotlib.image import imread
 
 from table_io.config.base import PROFILES_DIR, parse_toml
 from tests.reports.folders import COARSE
-from twin.cli.discover import write_results
-from twin.cli.run import list_model_warnings
-from twin.identification.discover import Discovery, PreparedLog, discover_effects
-from twin.identification.parameters import GapKey
-from twin.model.config import ModelConfig
-from twin.model.effects.typesetting import typeset_law
-from twin.model.inverse_dynamics import forces_along
-from twin.reports.discovery.figure_data import (
+from twin.discovery.discover import Discovery, PreparedLog, discover_effects
+from twin.discovery.discover_command import write_results
+from twin.discovery.figure_data import (
     DiscoveryView,
     check_instruments,
     entries_to_samples,
     measured_forces,
 )
-from twin.reports.discovery.free_running import compute_misfits, run_log_free, run_logs_free
-from twin.reports.discovery.headline import format_verdict
-from twin.reports.discovery.loading import load_logs, name_logs
-from twin.reports.discovery.page import format_with_interval
-from twin.reports.discovery.serialize import Json, verdict_to_json
-from twin.reports.page import format_significant
-from twin.reports.plot_style import RC_PARAMS
-from twin.run.run_config import read_model_template, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.discovery.free_running import compute_misfits, run_log_free, run_logs_free
+from twin.discovery.headline import format_verdict
+from twin.discovery.loading import load_logs, name_logs
+from twin.discovery.page import format_with_interval
+from twin.discovery.parameters import GapKey
+from twin.discovery.serialize import Json, verdict_to_json
+from twin.drawing.page import format_significant
+from twin.drawing.plot_style import RC_PARAMS
+from twin.live.run_command import list_model_warnings
+from twin.model.config import ModelConfig
+from twin.model.effects.typesetting import typeset_law
+from twin.model.inverse_dynamics import forces_along
+from twin.setup.run_config import read_model_template, read_run_config
+from twin.setup.unpaced import play_unpaced
 
 HARDENING_N_M2 = 4.0e7  # N/m2
 SHORT = """

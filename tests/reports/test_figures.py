@@ -13,12 +13,12 @@ from table_io.block import Block
 from table_io.records import Params
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import STEPS, blocks, one_step, signals, summary
+from twin.drawing.plot_style import PRECOMPRESSION_COLOUR, QuickLayout
 from twin.model.parameters import Parameters
 from twin.recording.columns import StoredItems
 from twin.recording.reader import read_recording
-from twin.reports.figures import draw_run_figures
-from twin.reports.plot_style import PRECOMPRESSION_COLOUR, QuickLayout
-from twin.reports.report_data import (
+from twin.report.figures import draw_run_figures
+from twin.results.report_data import (
     ReportData,
     build_report_data,
     compute_prestress,

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from tests.recovery.scaled_specimens import Hidden, prepare, record_block, simulate, start_model
-from twin.identification.discover import Discovery, PreparedLog, discover_effects
-from twin.identification.parameters import EffectKey
-from twin.reports.discovery.figure_data import DiscoveryView
-from twin.reports.discovery.force_figures import draw_residual_forces
+from twin.discovery.discover import Discovery, PreparedLog, discover_effects
+from twin.discovery.figure_data import DiscoveryView
+from twin.discovery.force_figures import draw_residual_forces
+from twin.discovery.parameters import EffectKey
 
 CUBIC = Hidden("cubic_stiffness", 3e6)
 

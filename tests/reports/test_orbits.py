@@ -15,9 +15,9 @@ from twin.monitor.curves import draw_prc
 from twin.monitor.run_state import LiveRunState
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports.orbits import find_measured_folds, read_planned_branch
-from twin.reports.report import write_report
-from twin.reports.summary import parse_toml_tables, summarise, write_summary
+from twin.report.report import write_report
+from twin.results.orbits import find_measured_folds, read_planned_branch
+from twin.results.summary import parse_toml_tables, summarise, write_summary
 from twin.transport.codec import decode_item, encode_item, topic_for
 from twin.viewer.plots import OrbitCurves
 

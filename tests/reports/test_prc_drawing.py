@@ -10,16 +10,16 @@ from matplotlib.figure import Figure
 from table_io.records import PrcPoint
 from tests.reports.recordings import summary
 from twin.compare.curves import PrcJump
-from twin.reports.plot_style import twin_style
-from twin.reports.prc_drawing import (
+from twin.drawing.plot_style import twin_style
+from twin.drawing.prc_drawing import (
     Panel,
     break_at_jumps,
     draw_jumps,
     make_prc_panels,
     plot_prc,
 )
-from twin.reports.report_data import extract_prc
-from twin.reports.summary import prc_points
+from twin.results.report_data import extract_prc
+from twin.results.summary import prc_points
 
 
 @pytest.fixture

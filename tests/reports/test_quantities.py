@@ -2,7 +2,7 @@
 
 import pytest
 
-from twin.reports.quantities import format_quantity
+from twin.results.quantities import format_quantity
 
 
 @pytest.mark.parametrize(

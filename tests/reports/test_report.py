@@ -17,11 +17,11 @@ from tests.input_errors import raises_input_error
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import MEASURED, blocks, one_step, start_record, summary
 from twin.campaign import STATE_FILE
+from twin.drawing.page import format_significant
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.reports.page import format_significant
-from twin.reports.report import render_report, write_report
-from twin.reports.report_data import build_report_data
+from twin.report.report import render_report, write_report
+from twin.results.report_data import build_report_data
 from twin.transport.codec import Item
 
 pytestmark = pytest.mark.usefixtures("draft")

@@ -12,7 +12,7 @@ from tests.input_errors import raises_input_error
 from tests.reports.folders import make
 from tests.reports.recordings import summary
 from twin.cli.run_path import parse_run_path
-from twin.reports.run_index import (
+from twin.report.run_index import (
     find_last_run,
     find_run_folders,
     index_runs,

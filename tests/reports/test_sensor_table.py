@@ -11,7 +11,7 @@ from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart
 from twin.cli.main import app
 from twin.recording.reader import read_recording
-from twin.reports.sensor_table import build_sensor_rows
+from twin.results.sensor_table import build_sensor_rows
 
 TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 ACC, CELL = 'channel = "table_acc_m_s2"\n', 'channel = "force_l2_n"\n'

@@ -27,9 +27,9 @@ from table_io.records import (
 from twin.compare import COMPARED_CHANNELS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.reports.summary import dump_strict_json, summarise, write_summary
-from twin.run.run_config import RunConfig, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.results.summary import dump_strict_json, summarise, write_summary
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
 
 PROFILE = """

@@ -15,20 +15,20 @@ from table_io.config.profile import Profile
 from table_io.config.tracking import TrackingConfig
 from table_io.units import GRAVITY_M_S2
 from tests.run.test_record import NO_CHECK, RIG, Run, play_run
-from twin.drive.spectra import compute_response_spectrum
-from twin.drive.tracking import TrackingError, judge_tracking
+from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.reports.contracts import RunSummary, TrackingResult
-from twin.reports.report import write_report
-from twin.reports.summary import dump_contract, format_summary, write_summary
-from twin.reports.table_motion import (
+from twin.report.report import write_report
+from twin.results.contracts import RunSummary, TrackingResult
+from twin.results.spectra import compute_response_spectrum
+from twin.results.summary import dump_contract, format_summary, write_summary
+from twin.results.table_motion import (
     find_table_motion,
     format_tracking,
     list_required_frequencies,
     summarise_tracking,
 )
-from twin.reports.table_motion_figures import MOTION_FIGURES
+from twin.results.tracking import TrackingError, judge_tracking
 
 
 @pytest.fixture(scope="module")

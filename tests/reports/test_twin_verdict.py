@@ -12,15 +12,15 @@ import pytest
 from table_io.block import Block
 from table_io.config.toml_text import format_toml
 from twin.recording.reader import read_recording
-from twin.reports.summary import Json, summarise, write_summary
-from twin.reports.twin_verdict import (
+from twin.results.summary import Json, summarise, write_summary
+from twin.results.twin_verdict import (
     _add_cycles,
     _median_half_range,
     judge_twin,
     name_command,
 )
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import play_unpaced
 from twin.validation.study.rig_setup import NOMINAL_RIG
 
 TEST = """

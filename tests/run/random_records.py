@@ -25,7 +25,7 @@ from table_io.errors import InputError
 from table_io.records import RunStop, Trip
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, read_run_config
 
 ROUNDING_RATIO = 1.01  # of the converter and of differences
 TABLE_ALLOWANCE = 1.3  # by which a table may ring beyond the motion of its command

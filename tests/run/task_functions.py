@@ -4,7 +4,7 @@ import os
 import signal
 from pathlib import Path
 
-from twin.run.tasks import Workers, run_tasks
+from twin.system.process_pool import Workers, run_tasks
 
 
 def return_process(number: int) -> int:

@@ -15,14 +15,14 @@ from tests.model.reference import snm
 from tests.table_io.acquisition.test_orbit_session import RATE_HZ, Run, run
 from twin.dynamics.period_map import make_period_map
 from twin.model.model import Model
-from twin.run.feedback_gains import FeedbackTiming
-from twin.run.orbit_plan import make_backbone_plan
-from twin.run.phase_resonance import (
+from twin.setup.feedback_gains import FeedbackTiming
+from twin.setup.orbit_plan import make_backbone_plan
+from twin.setup.phase_resonance import (
     find_phase_resonance,
     find_resonance_approach,
     measure_orbit_phase,
 )
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 
 RANGE_HZ = (1.3, 4.5)
 TIMING = FeedbackTiming(latency_s=0.045, jitter_s=0.005, block_s=0.01)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from table_io.errors import InputError
-from twin.run.diagnostics import LEVEL_VARIABLE, LEVELS, configure_logging
+from twin.system.diagnostics import LEVEL_VARIABLE, LEVELS, configure_logging
 
 LOG = logging.getLogger("twin.live.test")
 

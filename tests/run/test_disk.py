@@ -8,9 +8,9 @@ import pytest
 from table_io.config.base import PROFILES_DIR
 from tests.input_errors import raises_input_error
 from twin.campaign.command import CampaignOptions, run_campaign
-from twin.cli import run
-from twin.run import disk
-from twin.run.disk import (
+from twin.live import run_command as run
+from twin.setup import disk
+from twin.setup.disk import (
     DiskForecast,
     DiskReserve,
     bytes_per_s,
@@ -18,7 +18,7 @@ from twin.run.disk import (
     planned_bytes,
     require_disk_space,
 )
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, read_run_config
 
 QUICK = PROFILES_DIR / "tests" / "quickstart.toml"
 ENDPOINT = "tcp/127.0.0.1:7447"

@@ -22,9 +22,9 @@ from twin.log import open_log
 from twin.monitor.panels import draw_limits, draw_twin, format_gaps
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.recording.reader import read_recording
-from twin.reports.predicted_ranges import predict_response
-from twin.reports.sensor_table import build_sensor_rows
-from twin.run.run_config import read_run_config
+from twin.results.sensor_table import build_sensor_rows
+from twin.rig.predicted_ranges import predict_response
+from twin.setup.run_config import read_run_config
 from twin.transport.codec import Item
 
 PROFILE = """

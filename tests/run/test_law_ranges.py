@@ -13,7 +13,6 @@ from rich.console import Console
 from table_io.block import join_blocks
 from table_io.records import Event
 from twin.campaign.simulate_grid import simulate_peaks
-from twin.cli.check import print_plan
 from twin.cli.simulate import simulate_profile
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
@@ -21,12 +20,13 @@ from twin.model.stepped_sine import SteppedSineResponse
 from twin.model.valid_range import select_first_exits
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.recording.reader import read_recording
-from twin.reports.report import render_report
-from twin.reports.report_data import build_report_data
-from twin.reports.summary import summarise
-from twin.run.progress import RunProgress
-from twin.run.run_config import read_model, read_run_config
-from twin.run.unpaced import simulate_ideal
+from twin.report.report import render_report
+from twin.results.report_data import build_report_data
+from twin.results.summary import summarise
+from twin.rig.check import print_plan
+from twin.setup.run_config import read_model, read_run_config
+from twin.setup.unpaced import simulate_ideal
+from twin.system.progress import RunProgress
 
 PROFILE = """
 title = "two frequencies"

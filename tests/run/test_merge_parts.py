@@ -8,11 +8,11 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
+from twin.recording import merge_parts
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import verify_log
+from twin.recording.merge_parts import LOCK_FILE, merge_run_parts
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.run import merge_parts
-from twin.run.merge_parts import LOCK_FILE, merge_run_parts
 from twin.transport.codec import encode_item, topic_for
 
 ITEMS = [start_record(), *blocks()[:60]]

@@ -11,9 +11,9 @@ from tests.input_errors import raises_input_error
 from tests.model.reference import AG, snm
 from twin.dynamics.period_map import make_period_map
 from twin.model.model import Model
-from twin.run.feedback_gains import FeedbackTiming, OpenLoop, closed_loop_multipliers
-from twin.run.orbit_plan import find_unstable_stretch, make_orbit_plan
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.feedback_gains import FeedbackTiming, OpenLoop, closed_loop_multipliers
+from twin.setup.orbit_plan import find_unstable_stretch, make_orbit_plan
+from twin.setup.run_config import RunConfig, read_run_config
 
 RANGE_HZ = (2.75, 4.1)
 FEEDBACK_TIMING = FeedbackTiming(latency_s=0.046, jitter_s=0.005, block_s=0.01)
@@ -156,7 +156,7 @@ def test_a_profile_that_is_no_table_cannot_take_a_plan(tmp_path, monkeypatch):
     def make_no_plan(*_) -> None:
         raise AssertionError("a plan was made")
 
-    monkeypatch.setattr("twin.run.orbit_plan.make_orbit_plan", make_no_plan)
+    monkeypatch.setattr("twin.setup.orbit_plan.make_orbit_plan", make_no_plan)
     path = tmp_path / "inline.toml"
     path.write_text(
         'title = "Inline"\n'

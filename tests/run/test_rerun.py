@@ -9,17 +9,17 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import PredictionHash
-from twin.cli.verify import examine_logs
 from twin.exchange.export import export_log
 from twin.log import open_log
 from twin.recording.log_metadata import select_recorded
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
-from twin.run.recordings import read_recorded_config
-from twin.run.rerun import restore_predictions
-from twin.run.run_config import RunConfig
-from twin.run.unpaced import play_unpaced
+from twin.replay.verify import examine_logs
+from twin.results.recordings import read_recorded_config
+from twin.results.rerun import restore_predictions
+from twin.setup.run_config import RunConfig
+from twin.setup.unpaced import play_unpaced
 
 
 @pytest.fixture(scope="module")

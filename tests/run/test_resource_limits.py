@@ -9,7 +9,7 @@ import pytest
 
 from table_io.errors import InputError
 from twin.cli import entry
-from twin.run.resource_limits import MIN_OPEN_FILES, WANTED_OPEN_FILES, require_open_files
+from twin.system.resource_limits import MIN_OPEN_FILES, WANTED_OPEN_FILES, require_open_files
 
 MAIN = "from twin.cli.entry import main; main()"
 

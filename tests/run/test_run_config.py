@@ -6,7 +6,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
-from twin.run.run_config import read_model_template, read_run_config
+from twin.setup.run_config import read_model_template, read_run_config
 
 QUICKSTART = PROFILES_DIR / "tests" / "quickstart.toml"
 

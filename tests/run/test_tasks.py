@@ -16,9 +16,9 @@ from table_io.clock import RealClock
 from tests.input_errors import raises_input_error
 from tests.run import task_functions
 from tests.run.clusters import start_cluster
-from twin.run.folders import find_sharing_problem
-from twin.run.tasks import TaskResult, Workers, order_results, run_tasks
-from twin.run.versions import read_installed_versions
+from twin.setup.folders import find_sharing_problem
+from twin.system.process_pool import TaskResult, Workers, order_results, run_tasks
+from twin.system.versions import read_installed_versions
 
 
 @pytest.fixture(scope="module")
@@ -163,12 +163,12 @@ def test_a_scheduler_that_does_not_answer_is_refused(unused_port: int) -> None:
 
 @pytest.fixture
 def unused_port(monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr("twin.run.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("twin.system.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
     return 9
 
 
 def test_a_cluster_whose_workers_all_die_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.run.dask_cluster.MAX_IDLE_S", 2.0)
+    monkeypatch.setattr("twin.system.dask_cluster.MAX_IDLE_S", 2.0)
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
@@ -197,7 +197,7 @@ def test_a_worker_of_another_version_is_refused(
     scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     versions = read_installed_versions() | {"numpy": "0.1"}
-    monkeypatch.setattr("twin.run.dask_cluster.read_installed_versions", lambda: versions)
+    monkeypatch.setattr("twin.system.dask_cluster.read_installed_versions", lambda: versions)
     with raises_input_error(problem="numpy 0.1", key="--scheduler"):
         list(run_tasks(task_functions.square, [1], Workers(0, scheduler)))
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from twin.run import temporary_folders
-from twin.run.temporary_folders import (
+from twin.system import temporary_folders
+from twin.system.temporary_folders import (
     MIN_AGE_S,
     SOCKET_PREFIX,
     VIEW_PREFIX,
@@ -22,7 +22,7 @@ from twin.run.temporary_folders import (
 OWNER = """
 import sys, time
 from pathlib import Path
-from twin.run import temporary_folders
+from twin.system import temporary_folders
 temporary_folders.find_temporary_parent = lambda: Path(sys.argv[1])
 folder = temporary_folders.make_private_folder(sys.argv[2])
 (folder / "bus").touch()

@@ -17,11 +17,12 @@ from table_io.config.folders import find_config
 from table_io.records import Event, Fault, NormalizedResponse, PrcPoint, SampleGap
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary
-from twin.reports.prc_table import print_prc
-from twin.run import folders, terminal, warm_up
-from twin.run.folders import make_output_folder, make_run_folder
-from twin.run.progress import GAP_SERIES_SAMPLES, RunProgress
-from twin.run.run_config import read_run_config
+from twin.report.prc_table import print_prc
+from twin.setup import folders, warm_up
+from twin.setup.folders import make_output_folder, make_run_folder
+from twin.setup.run_config import read_run_config
+from twin.system import terminal
+from twin.system.progress import GAP_SERIES_SAMPLES, RunProgress
 
 
 def print_lines(width: int) -> list[str]:
@@ -91,7 +92,7 @@ def test_two_commands_never_write_into_one_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
     code = f"""
 from pathlib import Path
-from twin.run.folders import make_output_folder
+from twin.setup.folders import make_output_folder
 make_output_folder(Path({str(out)!r}), "")
 print("mine", flush=True)
 input()

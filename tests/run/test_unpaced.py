@@ -22,9 +22,9 @@ from table_io.records import (
 )
 from twin.compare.twins import HISTORY_S
 from twin.recording.reader import Recording, read_recording
-from twin.reports.summary import summarise
-from twin.run.run_config import RunConfig, read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.results.summary import summarise
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
 
 LEVEL = 0.05 * 9.80665

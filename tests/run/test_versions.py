@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 import twin
-from twin.run import versions
-from twin.run.versions import NUMERICS_REVISION, compare_versions, find_version_changes
+from twin.system import versions
+from twin.system.versions import NUMERICS_REVISION, compare_versions, find_version_changes
 
 # Of model and comparison without names, comments and docstrings. When it differs, replay recordings
 # that were made before the change: where all are bit-identical, renew the hash; where one is not,

@@ -11,11 +11,11 @@ from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
 from twin.recording.columns import StoredItems
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
-from twin.reports.report import format_headline
-from twin.reports.report_data import build_report_data, extract_prc
-from twin.reports.summary import format_summary, summarise
-from twin.run.run_config import RunConfig, from_texts
-from twin.run.unpaced import play_unpaced
+from twin.report.report import format_headline
+from twin.results.report_data import build_report_data, extract_prc
+from twin.results.summary import format_summary, summarise
+from twin.setup.run_config import RunConfig, from_texts
+from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import encode_item
 
 PROFILE = """

@@ -16,7 +16,7 @@ from pathlib import Path
 from table_io.sim.simulated_table import SimulatedBackend
 from table_io.clock import ManualClock
 from table_io.acquisition.session import run_session
-from twin.run.run_config import compile_rig_kernels, read_run_config
+from twin.setup.run_config import compile_rig_kernels, read_run_config
 
 def compiled():
     return {(name, key): len(kernel.signatures) for name, module in list(sys.modules.items())

@@ -56,8 +56,8 @@ class Trials:
 
     def __init__(self, folder: Path) -> None:
         from twin.recording.reader import read_recording
-        from twin.run.run_config import read_run_config
-        from twin.run.unpaced import play_unpaced
+        from twin.setup.run_config import read_run_config
+        from twin.setup.unpaced import play_unpaced
         from twin.transport.codec import encode_item, topic_for
 
         self.folder = folder
@@ -163,7 +163,7 @@ def call_command(
     has none of `names` in it.
     """
     from twin.cli import main
-    from twin.reports import report as reports
+    from twin.report import report as reports
 
     kept, argv = reports.write_report, sys.argv
     sys.argv = ["shaketwin", *map(str, words)]

@@ -35,7 +35,7 @@ from twin.live.recorder import run_recorder
 from twin.recording.mcap_log import iter_messages
 from twin.recording.merge import merge, verify_log
 from twin.recording.recovery import recover_log
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, read_run_config
 from twin.transport import history_cache
 from twin.transport.codec import Item, encode_item, topic_for
 from twin.transport.endpoint import MEAS_TOPIC

@@ -21,7 +21,7 @@ from typing import Any
 
 from tests.live.namespaces import HERE, Cable, cable, start_isolated
 from tests.sweeps.small_study import read_stored_bytes
-from twin.run.system import count_cores
+from twin.system.files import count_cores
 
 ROOT = Path(__file__).resolve().parents[2]
 ADDRESS = f"tcp://{HERE}:8786"

@@ -25,8 +25,8 @@ from table_io.config.toml_text import format_toml
 from table_io.records import Event, Record
 from table_io.sim.imperfections import Level, draw_laboratory
 from twin.compare.monitoring import EVENT_KINDS
-from twin.run.run_config import RunConfig, from_texts
-from twin.run.unpaced import add_twin_items
+from twin.setup.run_config import RunConfig, from_texts
+from twin.setup.unpaced import add_twin_items
 
 ALL = ("ginf", "g30", "g16", "g10", "g4_ss1", "g4_ss2", "g4_ss3", "g0", "gm1", "gm2", "gm10")
 LOST_SHARE = 0.05

@@ -86,7 +86,7 @@ TARGETS = {
         ),
     ),
     "calibration": Target(
-        ("table_io/config/calibration*.py", "twin/cli/calibrate.py"),
+        ("table_io/config/calibration*.py", "twin/rig/calibrate.py"),
         ("tests/table_io/config/test_calibration*.py", "tests/cli/test_calibrate.py"),
     ),
     "drive": Target(

@@ -16,13 +16,13 @@ import time
 from pathlib import Path
 
 from table_io.config.base import PROFILES_DIR
-from twin.cli.run import run_test
+from twin.live.run_command import run_test
 from twin.recording.run_paths import resolve_log_path
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
-from twin.run.recordings import read_recorded_config
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import play_unpaced
-from twin.run.warm_up import compile_kernels
+from twin.results.recordings import read_recorded_config
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import play_unpaced
+from twin.setup.warm_up import compile_kernels
 
 COLUMNS = (
     "log", "how", "samples", "compared", "differing", "missing", "identical", "open_s", "replay_s",

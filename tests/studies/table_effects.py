@@ -2,9 +2,10 @@
 
     python -m tests.studies.table_effects [CASES] [SEED] [FILE]
 
-Random tables of `tests/drive/planted_tables.py`, one third without an effect, are rehearsed and
-identified; a line of JSON is written for each, and the counts at the end. The limits of
-`twin/drive/table_effects.py` were set on tables of the seeds 100 and 200, not on those of a study.
+Random tables of `tests/earthquakes/planted_tables.py`, one third without an effect, are rehearsed
+and identified; a line of JSON is written for each, and the counts at the end. The limits of
+`twin/earthquakes/table_effects.py` were set on tables of the seeds 100 and 200, not on those of a
+study.
 """
 
 import json
@@ -16,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from tests.drive.hydraulic_rig import TABLE
-from tests.drive.planted_tables import SIZES, PlantedTable, draw_table, record_rehearsal
-from twin.drive.table_effects import EFFECT_BY_ID, describe_size, discover_table_effects
-from twin.drive.table_identification import RehearsalProblem, fit_basic_twin
+from tests.earthquakes.hydraulic_rig import TABLE
+from tests.earthquakes.planted_tables import SIZES, PlantedTable, draw_table, record_rehearsal
+from twin.earthquakes.table_effects import EFFECT_BY_ID, describe_size, discover_table_effects
+from twin.earthquakes.table_identification import RehearsalProblem, fit_basic_twin
 
 MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
 

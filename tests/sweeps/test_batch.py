@@ -5,7 +5,7 @@ import json
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.run.run_config import read_model
+from twin.setup.run_config import read_model
 from twin.studies.batch import Batch, read_batch, simulate_case
 from twin.studies.cases import make_gap_variants
 

@@ -27,7 +27,6 @@ from tests.sweeps.small_study import (
     write_study,
 )
 from twin.api import open_study
-from twin.run.tasks import TaskResult
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps import command
 from twin.studies.maps.compute import (
@@ -39,6 +38,7 @@ from twin.studies.maps.store import (
     remove_partial_files,
 )
 from twin.studies.maps.study import Study
+from twin.system.process_pool import TaskResult
 
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
 
@@ -392,7 +392,7 @@ def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path
 def test_a_scheduler_that_does_not_answer_leaves_no_folder(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("twin.run.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("twin.system.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
     with raises_input_error(key="--scheduler"):
         command.run_study(
             whole_study / "study.toml", tmp_path / "out", None, "tcp://127.0.0.1:9", False, False

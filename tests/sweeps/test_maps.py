@@ -22,7 +22,7 @@ from twin.compare.curves import detect_hysteresis
 from twin.model.effects import find_effect
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
-from twin.reports.ideal_points import compute_prc_points
+from twin.results.ideal_points import compute_prc_points
 from twin.studies.maps.cases import list_parameter_names, parameter_unit
 from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.config import StudyConfig

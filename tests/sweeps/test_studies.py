@@ -23,8 +23,8 @@ from twin.cli.simulate import simulate_profile
 from twin.model.effects.effect import Effect, EffectParameter
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.run_config import read_model
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.run_config import read_model
 from twin.studies import figures
 from twin.studies.cases import parse_gaps_mm
 from twin.studies.rows import COLUMNS, read_batch_rows

@@ -192,8 +192,8 @@ def list_kernels() -> list[Any]:
     from table_io import sensor_errors
     from table_io.safety.protection import sample_checks
     from table_io.sim import plant
-    from twin.drive import spectra, table_model
     from twin.dynamics import event_driven_kernel, stroboscopic_kernel
+    from twin.earthquakes import table_model
     from twin.model import (
         closed_form_kernel,
         event_integrator_kernel,
@@ -201,6 +201,7 @@ def list_kernels() -> list[Any]:
         periodic_orbit,
         stepped_sine_kernel,
     )
+    from twin.results import spectra
 
     return [
         kernel

@@ -8,10 +8,10 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from tests.input_errors import raises_input_error
-from twin.identification.discover import discover_effects
-from twin.identification.parameters import STIFFNESS, EffectKey
-from twin.reports.discovery.loading import load_logs
-from twin.run.run_config import read_model_template
+from twin.discovery.discover import discover_effects
+from twin.discovery.loading import load_logs
+from twin.discovery.parameters import STIFFNESS, EffectKey
+from twin.setup.run_config import read_model_template
 from twin.validation.study.decisive_runs import (
     evaluate_decision,
     format_rates,

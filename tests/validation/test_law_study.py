@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from tests.identification.played import SNM
+from tests.discovery.played import SNM
 from twin.validation.study.law_study import (
     STEADY_CYCLES,
     STRONGER_TEST,

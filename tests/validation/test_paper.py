@@ -15,17 +15,17 @@ from typer.testing import CliRunner
 from tests.input_errors import raises_input_error
 from tests.reports.folders import BARE, COARSE
 from twin.cli.main import app
-from twin.reports import plot_style
-from twin.reports.measured_campaign import load_measured_campaign
-from twin.reports.report_data import extract_prc
-from twin.validation.paper import command
-from twin.validation.paper.findings import count_onsets_per_cycle, find_bands
-from twin.validation.paper.study import CHAOS_SCAN_HZ, PaperStudy, run_paper_study
-from twin.validation.paper.table import (
+from twin.drawing import plot_style
+from twin.paper import command
+from twin.paper.findings import count_onsets_per_cycle, find_bands
+from twin.paper.study import CHAOS_SCAN_HZ, PaperStudy, run_paper_study
+from twin.paper.table import (
     ComparisonRow,
     format_uncertain,
     make_comparison_table,
 )
+from twin.results.measured_campaign import load_measured_campaign
+from twin.results.report_data import extract_prc
 
 
 @pytest.fixture(scope="module")

@@ -10,15 +10,15 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.reports.folders import BARE, COARSE
+from twin.drawing import plot_style
 from twin.model.model import Model
 from twin.model.parameters import Parameters
-from twin.reports import plot_style
-from twin.reports.paper_cases import load_paper_cases
-from twin.reports.players import ClosedFormSimulator, NumericalSimulator, make_simulator
-from twin.reports.slow_passage import COARSE_EFFORT, SlowSweep
-from twin.run.run_config import read_model
-from twin.validation.paper import command, findings, study
-from twin.validation.paper.table import DEPARTS, make_comparison_table
+from twin.paper import command, findings, study
+from twin.paper.slow_passage import COARSE_EFFORT, SlowSweep
+from twin.paper.table import DEPARTS, make_comparison_table
+from twin.results.paper_cases import load_paper_cases
+from twin.results.players import ClosedFormSimulator, NumericalSimulator, make_simulator
+from twin.setup.run_config import read_model
 
 AG = 0.05 * 9.80665
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
@@ -169,7 +169,7 @@ def test_the_paper_s_model_integrated_finds_what_closed_form_finds(
 ) -> None:
     """Every statement but those that only the one-period map can make."""
     want = {row.key: row for row in make_comparison_table(study.run_paper_study())}
-    monkeypatch.setattr("twin.reports.paper_cases.make_simulator", NumericalSimulator)
+    monkeypatch.setattr("twin.results.paper_cases.make_simulator", NumericalSimulator)
     got = {row.key: row for row in make_comparison_table(study.run_paper_study())}
     assert got.keys() == want.keys()
     assert {key: row.verdict for key, row in got.items()} == {

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, format_truth, log
+from tests.discovery.played import SNM, format_truth, log
 from tests.validation.test_study_scores import about, verdict
 from twin.validation.study import baselines
 from twin.validation.study.baseline_terms import make_regression_problem

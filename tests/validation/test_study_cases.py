@@ -14,7 +14,7 @@ from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, GroundTruth
 from twin.recording.reader import read_recording as read_log
-from twin.run.recordings import read_recorded_config
+from twin.results.recordings import read_recorded_config
 from twin.validation.study import amplitude_search, generation, strata
 from twin.validation.study.amplitude_search import (
     BaselineResidual,

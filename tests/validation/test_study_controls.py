@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.identification.played import SNM, format_truth, log
+from tests.discovery.played import SNM, format_truth, log
 from tests.validation import study_work
 from tests.validation.test_study_scores import about, verdict
-from twin.run.tasks import Workers
+from twin.system.process_pool import Workers
 from twin.validation.study.command import run_cases
 from twin.validation.study.comparison_tables import compute_shuffled_rates
 from twin.validation.study.controls import discover_without, reverse_log, summarize_verdict

@@ -21,7 +21,7 @@ from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection
 from table_io.sim.simulated_table import build_plant
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
 from twin.recording.reader import read_recording
-from twin.run.run_config import from_texts
+from twin.setup.run_config import from_texts
 from twin.validation.study.command import run_discovery_study
 from twin.validation.study.generation import generate_case, play_unprotected
 from twin.validation.study.laboratory_report import compute_laboratory_metrics

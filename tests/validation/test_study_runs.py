@@ -12,7 +12,7 @@ from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from tests.validation import study_work
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
-from twin.run.tasks import Workers
+from twin.system.process_pool import Workers
 from twin.validation.study import evaluation
 from twin.validation.study.command import run_cases, run_discovery_study
 from twin.validation.study.generation import CasePaths

@@ -12,10 +12,10 @@ import pytest
 from table_io.block import Block
 from table_io.records import Event, PrcPoint, RunStart, RunStop
 from tests.input_errors import raises_input_error
-from twin.cli import view
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import MEAS_TOPIC
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
+from twin.viewer import command as view
 from twin.viewer import live_view
 from twin.viewer.live_view import LiveView
 

@@ -7,7 +7,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import NormalizedResponse, PrcPoint, RunStart
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 from twin.viewer.model_branches import ModelBranches
 
 FOLD_DOWN_HZ, FOLD_UP_HZ = 4.027372, 2.787294

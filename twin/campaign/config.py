@@ -14,7 +14,7 @@ from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.errors import InputError, suggest
 from table_io.safety.preflight import list_drive_warnings as coarse
 from twin.campaign.record_grid import LABEL_PATTERN, GridCell, RecordGrid, read_base, read_cell
-from twin.run.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, read_run_config
 
 ResumeMode = Literal["direction", "step", "run"]
 CheckRun = Callable[[RunConfig, Path], None]  # raises InputError if a run cannot be played

@@ -13,9 +13,7 @@ from table_io.units import GRAVITY_M_S2
 from twin.campaign.gap_comparison import GapComparison
 from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
-from twin.reports.measured_campaign import MeasuredCampaign
-from twin.reports.paper_cases import PaperCase, PaperTest, name_gap
-from twin.reports.plot_style import (
+from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     GUIDE_COLOUR,
     TRANSITION_COLOURS,
@@ -26,9 +24,11 @@ from twin.reports.plot_style import (
     direction_handles,
     save_figures,
 )
-from twin.reports.prc_families import draw_all_gaps, draw_transition
-from twin.reports.report_data import DIRECTIONS
-from twin.reports.summary import prc_points
+from twin.drawing.prc_families import draw_all_gaps, draw_transition
+from twin.results.measured_campaign import MeasuredCampaign
+from twin.results.paper_cases import PaperCase, PaperTest, name_gap
+from twin.results.report_data import DIRECTIONS
+from twin.results.summary import prc_points
 
 NEAR_HZ = 1e-9
 

@@ -22,7 +22,7 @@ from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
 from twin.campaign.merge import SOURCES
-from twin.reports.paper_cases import name_gap
+from twin.results.paper_cases import name_gap
 
 Json = dict[str, Any]
 PEAKS = ("u_m", "a_m_s2", "force_n")

@@ -18,7 +18,7 @@ from twin.campaign.gap_comparison import (
     GapComparison,
     format_gap,
 )
-from twin.reports.plot_style import CaptionedFigure, CaptionedFigures, LineStyle
+from twin.drawing.plot_style import CaptionedFigure, CaptionedFigures, LineStyle
 
 FIGURE_SIZE_IN = 11.0, 4.1
 TRADE_OFF_SIZE_IN = 11.0, 5.6

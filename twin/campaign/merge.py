@@ -14,8 +14,8 @@ from pathlib import Path
 from table_io.config.profile import Profile
 from twin.campaign.state import RunState
 from twin.compare.curves import detect_hysteresis
-from twin.reports.summary import Json, number_or_nan, prc_points
-from twin.reports.twin_verdict import judge_twin
+from twin.results.summary import Json, number_or_nan, prc_points
+from twin.results.twin_verdict import judge_twin
 
 NORMALIZED_BY_U_STAR, NORMALIZED_BY_A_STAR = (
     ("eta_d", "eta_r", "eta_l"),

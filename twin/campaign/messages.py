@@ -11,8 +11,8 @@ from twin.campaign.config import PlannedRun
 from twin.campaign.gap_comparison import CRITERIA, format_best, format_gap
 from twin.campaign.merge import merge_summaries, read_summary
 from twin.campaign.state import ActiveCampaign, OperatorAnswer
-from twin.reports.summary import Json, format_summary
-from twin.run.terminal import console, print_line, print_table
+from twin.results.summary import Json, format_summary
+from twin.system.terminal import console, print_line, print_table
 
 Reply = Literal["done", "skipped", "unattended", "not asked"]
 

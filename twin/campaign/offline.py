@@ -22,9 +22,9 @@ from twin.campaign.messages import (
 )
 from twin.campaign.state import ActiveCampaign
 from twin.live.process_config import ProcessConfig
-from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
-from twin.run.system import count_cores
-from twin.run.terminal import catch_interrupts, console, print_line
+from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
+from twin.system.files import count_cores
+from twin.system.terminal import catch_interrupts, console, print_line
 
 MAX_WORKERS = 2  # each holds a whole recording in memory while it writes the report
 

@@ -16,11 +16,11 @@ from twin.campaign.messages import (
 from twin.campaign.report import write_campaign_report
 from twin.campaign.state import ActiveCampaign, OperatorAnswer, write_summary_and_report
 from twin.live.supervisor import Supervisor
-from twin.reports.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
-from twin.run.merge_parts import merge_run_parts
-from twin.run.progress import RunProgress
-from twin.run.terminal import catch_interrupts, console, print_line
+from twin.recording.merge_parts import merge_run_parts
+from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.security.credentials import Credentials, credentials_folder
+from twin.system.progress import RunProgress
+from twin.system.terminal import catch_interrupts, console, print_line
 
 
 def play_realtime(

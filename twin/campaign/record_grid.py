@@ -20,7 +20,7 @@ from table_io.config.profile import Profile, attach_files, load_profile
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 from twin.model.config import ModelConfig
-from twin.run.run_config import RunConfig, build_run_config
+from twin.setup.run_config import RunConfig, build_run_config
 
 LABEL_PATTERN = r"^([A-Za-z0-9][A-Za-z0-9_.-]*)?$"
 KEYS_OF_BASE_RECORD = (

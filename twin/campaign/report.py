@@ -19,10 +19,10 @@ from twin.campaign.gap_comparison import (
     format_gap,
 )
 from twin.campaign.summary import CampaignData, read_campaign
-from twin.reports import summary as summaries
-from twin.reports.page import embed_images, format_significant, render_page
-from twin.reports.plot_style import Picture
-from twin.reports.summary import Json
+from twin.drawing.page import embed_images, format_significant, render_page
+from twin.drawing.plot_style import Picture
+from twin.results import summary as summaries
+from twin.results.summary import Json
 
 SYMBOLS = {
     ETA_A: "η<sub>a</sub>",

@@ -17,15 +17,15 @@ from twin.campaign.figures import draw_gap_pairs
 from twin.campaign.gap_comparison import compare_gaps, describe_comparison, list_record_runs
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import embed_pairs, list_gap_values
+from twin.drawing.page import render_page
 from twin.model.valid_range import EVENT_KIND
-from twin.reports.page import render_page
-from twin.reports.summary import Json, write_json
-from twin.reports.windows import extract_free_twin
-from twin.run.folders import make_run_folder
-from twin.run.run_config import RunConfig
-from twin.run.terminal import print_line, show_status
-from twin.run.unpaced import generate_ideal_twin
-from twin.run.warm_up import compile_kernels
+from twin.results.summary import Json, write_json
+from twin.results.windows import extract_free_twin
+from twin.setup.folders import make_run_folder
+from twin.setup.run_config import RunConfig
+from twin.setup.unpaced import generate_ideal_twin
+from twin.setup.warm_up import compile_kernels
+from twin.system.terminal import print_line, show_status
 
 
 def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:

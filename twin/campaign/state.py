@@ -21,17 +21,17 @@ from table_io.errors import InputError
 from twin.campaign import STATE_FILE
 from twin.campaign.config import CampaignPlan, PlannedRun, ResumeMode
 from twin.live.process_config import ProcessConfig
+from twin.recording.merge_parts import LOCK_FILE as PARTS_LOCK_FILE
+from twin.recording.merge_parts import merge_run_parts
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.reports import summary as summaries
-from twin.reports.report import write_report
-from twin.reports.summary import Json
-from twin.run.folders import replace_text
-from twin.run.merge_parts import LOCK_FILE as PARTS_LOCK_FILE
-from twin.run.merge_parts import merge_run_parts
-from twin.run.recordings import read_recorded_config
-from twin.run.run_config import RunConfig, make_run_id
-from twin.run.system import lock_file
+from twin.report.report import write_report
+from twin.results import summary as summaries
+from twin.results.recordings import read_recorded_config
+from twin.results.summary import Json
+from twin.setup.folders import replace_text
+from twin.setup.run_config import RunConfig, make_run_id
+from twin.system.files import lock_file
 
 CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 CALIBRATION_RECORDS = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)

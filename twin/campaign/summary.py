@@ -25,7 +25,7 @@ from twin.campaign.state import CAMPAIGN_FILE, CONFIG_FOLDER, CampaignState, Run
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
-from twin.reports.summary import Json
+from twin.results.summary import Json
 
 VERDICTS_BY_SEVERITY = ("halted", "aborted", "stopped")  # the most severe first
 

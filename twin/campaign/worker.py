@@ -14,7 +14,7 @@ from table_io.errors import InputError
 from table_io.records import PrcPoint
 from twin.campaign.state import write_summary_and_report
 from twin.live.process_config import ProcessConfig
-from twin.run.unpaced import play_unpaced
+from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
 
 

@@ -30,12 +30,12 @@ def read_keys_option(folder: Path | None, *, rig: bool = False) -> "Credentials 
     """Read and verify the credentials of --keys, None without it; warn if they expire soon."""
     if folder is None:
         return None
-    from twin.run.terminal import print_line
     from twin.security.credentials import (
         EXPIRY_WARNING_DAYS,
         read_credentials,
         read_rig_credentials,
     )
+    from twin.system.terminal import print_line
 
     keys = (read_rig_credentials if rig else read_credentials)(folder)
     if keys.days_left < EXPIRY_WARNING_DAYS:

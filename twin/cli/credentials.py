@@ -28,7 +28,6 @@ from rich.table import Table
 from table_io.clock import local_datetime
 from table_io.config.base import parse_toml
 from table_io.errors import InputError, suggest
-from twin.run.terminal import console, print_line, print_qr_code, print_table
 from twin.security.access_control import NO_ROLE, RIG_NAME, ROLES, ROUTER_ROLE, build_router_access
 from twin.security.certificate_authority import (
     CertificateKeyPair,
@@ -56,6 +55,7 @@ from twin.security.page_access import (
     hash_code,
     read_codes,
 )
+from twin.system.terminal import console, print_line, print_qr_code, print_table
 from twin.transport.endpoint import (
     PUBLIC_HUB_SETTINGS,
     check_endpoint,

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.errors import InputError
-from twin.run.resource_limits import MIN_MEMORY_BYTES, require_memory
+from twin.system.resource_limits import MIN_MEMORY_BYTES, require_memory
+from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 ORDERS = ("hold", "resume", "stop", "abort")
 NO_MEMORY_MESSAGE = "not enough memory: close other programs, or raise the limit `ulimit -v`"
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 
 
 def main() -> None:

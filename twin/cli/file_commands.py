@@ -50,7 +50,7 @@ def verify_command(
 
     Exit code 0: whole; 4: it has gaps, or the file is damaged or was altered; 2: no log.
     """
-    from twin.cli.verify import verify_logs as command
+    from twin.replay.verify import verify_logs as command
 
     raise typer.Exit(command(log, json, repair))
 
@@ -127,7 +127,7 @@ def import_command(
     """Import tables of samples as logs; without -o, propose which column is which channel."""
     from table_io.config.folders import resolve_config
     from table_io.errors import InputError
-    from twin.cli import import_files
+    from twin.exchange import import_command as import_files
 
     if profile is not None:
         profile = resolve_config(profile, "tests")

@@ -41,11 +41,11 @@ def check_command(
     table and the mass; the table is not driven.
     """
     if profile is not None and not (unattended or json):
-        from twin.cli.check import check_profile as preflight
+        from twin.rig.check import check_profile as preflight
 
         preflight(profile, table, out)
     elif profile is None and table is not None and out is None:
-        from twin.cli.check_table import check_wiring
+        from twin.rig.check_table import check_wiring
 
         raise typer.Exit(check_wiring(table, unattended, json))
     else:
@@ -93,8 +93,8 @@ def calibrate_command(
 
     Leaves a dated record, which goes into every recording from then on; the rig file is not edited.
     """
-    from twin.cli.calibrate import CalibrationRequest
-    from twin.cli.calibrate import calibrate_sensor as command
+    from twin.rig.calibrate import CalibrationRequest
+    from twin.rig.calibrate import calibrate_sensor as command
 
     request = CalibrationRequest(
         channel, table, points, shunt, tolerance, applied_sd, unattended, out
@@ -111,6 +111,6 @@ def devices_command(
     json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """List rig files, NI and openDAQ devices that respond, with their channels."""
-    from twin.cli.devices import print_devices as command
+    from twin.rig.devices import print_devices as command
 
     command(ni, json)

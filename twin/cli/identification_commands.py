@@ -89,13 +89,13 @@ def discover_missing_effect(
 ) -> None:
     """Find the physical effect the model is missing and refit with it."""
     if features is not None:
-        from twin.cli.discover_features import discover_by_features, require_no_logs
+        from twin.discovery.features_command import discover_by_features, require_no_logs
 
         require_no_logs(logs or [], held_out or [])
         raise typer.Exit(discover_by_features(features, model, out, without or []))
     if not logs:
         raise typer.BadParameter("give one LOG or more, or --features FILE", param_hint="LOG...")
-    from twin.cli import decide as decisive
+    from twin.discovery import decide_command as decisive
 
     options = decisive.parse_options(decide, run, rig, budget_min, yes, speed)
     if run and options is not None:
@@ -103,7 +103,7 @@ def discover_missing_effect(
             logs, model, out, without or [], held_out or [], options
         )
         raise typer.Exit(code)
-    from twin.cli.discover import judge_logs
+    from twin.discovery.discover_command import judge_logs
 
     raise typer.Exit(judge_logs(logs, model, out, without or [], held_out or [], options).code)
 
@@ -120,7 +120,7 @@ def identify_from_logs(
     ] = None,
 ) -> None:
     """Identify parameters and gaps, with uncertainty, from recordings; write a model file."""
-    from twin.cli.identify import identify_command as command
+    from twin.discovery.identify_command import identify_command as command
 
     raise typer.Exit(command(logs, model, out))
 
@@ -139,7 +139,7 @@ def identify_table_from_log(
     ] = True,
 ) -> None:
     """Identify the table itself from a rehearsal: oil, valve, friction, loop, frame, effects."""
-    from twin.cli.table_drive import identify_table_command as command
+    from twin.earthquakes.command import identify_table_command as command
 
     raise typer.Exit(command(logs, out, with_effects))
 

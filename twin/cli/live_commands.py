@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from twin.cli.credential_commands import KeysOption, read_keys_option
-from twin.cli.entry import DEFAULT_ENDPOINT
+from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 if TYPE_CHECKING:
     from twin.security.credentials import Credentials
@@ -132,6 +132,6 @@ def control_command(
 ) -> None:
     """Hold, resume, stop or abort a running test; the table always comes to rest smoothly."""
     from twin.live.control import send_command
-    from twin.run.terminal import print_line
+    from twin.system.terminal import print_line
 
     print_line(send_command(order.value, why, connect, rig, read_keys_option(keys)))

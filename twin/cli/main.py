@@ -11,7 +11,6 @@ from typing import Annotated
 import typer
 
 from twin.cli.credential_commands import KeysOption, keys_app, read_keys_option
-from twin.cli.entry import DEFAULT_ENDPOINT
 from twin.cli.examples import add_examples, complete_names, describe_names
 from twin.cli.file_commands import StepsOption, files_app, require_view_extra
 from twin.cli.hardware_commands import hardware_app
@@ -19,7 +18,8 @@ from twin.cli.identification_commands import identification_app
 from twin.cli.live_commands import WebListenOption, WebOption, live_app, start_page
 from twin.cli.reference_commands import reference_app
 from twin.cli.run_path import LOG_HELP, parse_run_path
-from twin.run.diagnostics import configure_logging
+from twin.system.diagnostics import configure_logging
+from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
 # Set before numpy is imported; child processes inherit it.
@@ -150,7 +150,7 @@ def run_command(
     web_listen: WebListenOption = "",
 ) -> None:
     """Run a test: drive the table, acquire, run the twin, publish, record, report."""
-    from twin.cli.run import run_test as command
+    from twin.live.run_command import run_test as command
 
     unpaced, credentials = speed is Speed.max, read_keys_option(keys, rig=True)
     page = web_listen if web or web_listen else None
@@ -194,7 +194,7 @@ def table_drive_command(
     ] = Speed.realtime,
 ) -> None:
     """Compute the command by which the table follows a record, on the table's twin."""
-    from twin.cli.table_drive import compute_drive_command as command
+    from twin.earthquakes.command import compute_drive_command as command
 
     unpaced = speed is Speed.max
     raise typer.Exit(command(profile, twin, band_hz, out, table, after, iterate, unpaced))
@@ -217,7 +217,7 @@ def demo_command(
     ] = True,
 ) -> None:
     """Demonstrate it in two minutes: an effect hidden at random, found, added, and unsealed."""
-    from twin.cli.demo import run_demo as command
+    from twin.demo.command import run_demo as command
 
     raise typer.Exit(command(out, seed, keep, show_page))
 
@@ -303,8 +303,8 @@ def table_command(
     ] = 5.0,
 ) -> None:
     """Start the simulated table as a separate machine, for `run PROFILE --table machine`."""
-    from twin.cli.table import ExternalController
-    from twin.cli.table import serve_table as command
+    from twin.rig.table import ExternalController
+    from twin.rig.table import serve_table as command
 
     command(rig, listen, log, time_scale, sys.stdout, profile, ExternalController(play, ppm, after))
 
@@ -415,8 +415,8 @@ def branches_command(
     out: OutOption = None,
 ) -> None:
     """Follow the periodic motions of the model, stable and unstable; locate bifurcations."""
-    from twin.cli.branches import BranchRequest
-    from twin.cli.branches import show_branches as command
+    from twin.branches.command import BranchRequest
+    from twin.branches.command import show_branches as command
 
     request = BranchRequest(
         profile, model, gap, level, over, low, high, at, complete, attractors, basins, out
@@ -482,7 +482,7 @@ def replay_command(
 
     Several logs or models give one table of the error of each model on each recording.
     """
-    from twin.cli.replay import ReplayRequest, replay_logs
+    from twin.replay.command import ReplayRequest, replay_logs
 
     credentials = read_keys_option(keys, rig=True)
     request = ReplayRequest(
@@ -512,7 +512,7 @@ def paper_command(
     ] = None,
 ) -> None:
     """Reproduce the paper's figures and list where the model agrees or departs."""
-    from twin.validation.paper.command import compare_with_paper as command
+    from twin.paper.command import compare_with_paper as command
 
     command(out, campaign or [], model)
 
@@ -561,7 +561,7 @@ def view_command(
 ) -> None:
     """Open Rerun with the project's layout, on a recording or a running test."""
     require_view_extra(True)
-    from twin.cli.view import show_view as command
+    from twin.viewer.command import show_view as command
 
     command(log, save, picture, connect, rig, read_keys_option(keys), web)
 
@@ -577,7 +577,7 @@ def runs_command(
     ] = None,
 ) -> None:
     """List the runs in a folder: date, test, gap, verdicts, misfit, warnings."""
-    from twin.cli.runs import print_runs as command
+    from twin.report.runs_command import print_runs as command
 
     command(folder, json, page)
 
@@ -590,7 +590,7 @@ def compare_command(
     out: OutOption = None,
 ) -> None:
     """Compare two runs, or one with two models: curves, jumps, parameters, misfit."""
-    from twin.cli.compare import compare_runs as command
+    from twin.report.compare_command import compare_runs as command
 
     command(first, second, json, out)
 
@@ -602,7 +602,7 @@ def guide_command(
     ] = None,
 ) -> None:
     """Open the user guide in the browser; it needs no network."""
-    from twin.cli.guide import open_guide as command
+    from twin.guide.command import open_guide as command
 
     command(out, app)
 

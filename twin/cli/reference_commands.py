@@ -46,7 +46,7 @@ def list_names_command(
     kind: Annotated[ListKind, typer.Argument(metavar="|".join(ListKind), help="What to list.")],
 ) -> None:
     """List the names that commands take: yours first, then the shipped ones."""
-    from twin.cli.reference import print_names as command
+    from twin.guide.reference_command import print_names as command
 
     command(kind)
 
@@ -60,7 +60,7 @@ def new_file_command(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New .toml file.")],
 ) -> None:
     """Write a commented file to edit; `check` accepts a new test as it is."""
-    from twin.cli.reference import write_template as command
+    from twin.guide.reference_command import write_template as command
 
     command(kind, file)
 
@@ -72,7 +72,7 @@ def explain_command(
     ],
 ) -> None:
     """Explain a key of a file: its meaning, unit, default and limits."""
-    from twin.cli.reference import explain_key as command
+    from twin.guide.reference_command import explain_key as command
 
     command(key)
 
@@ -85,6 +85,6 @@ def schema_command(
     ] = None,
 ) -> None:
     """Print the JSON schema of a kind of file, by which editors complete and check its keys."""
-    from twin.cli.reference import write_schema as command
+    from twin.guide.reference_command import write_schema as command
 
     command(kind, out)

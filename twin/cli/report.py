@@ -4,17 +4,17 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
-from twin.reports import summary as summaries
-from twin.run.recordings import open_recording, read_recorded_config
-from twin.run.terminal import console, print_line
+from twin.results import summary as summaries
+from twin.results.recordings import open_recording, read_recorded_config
 from twin.studies import DEFINITION_FILE, TABLE_FILE
+from twin.system.terminal import console, print_line
 
 FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
 
 
 def print_recording_prc(log: Path, as_json: bool) -> None:
     """Print the PRC of a recording, or of every run of a campaign, as a table or JSON."""
-    from twin.reports.prc_table import print_prc
+    from twin.report.prc_table import print_prc
 
     keys = ("run", "u_star_m", "a_star_m_s2", "steps", "jumps", "hysteresis")
     if (log / STATE_FILE).is_file():
@@ -53,9 +53,9 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
+    from twin.recording.merge_parts import merge_run_parts
     from twin.recording.run_paths import PARTS_FOLDER
-    from twin.reports.report import load_report_data, write_report
-    from twin.run.merge_parts import merge_run_parts
+    from twin.report.report import load_report_data, write_report
 
     if (folder / PARTS_FOLDER).is_dir():
         merge_run_parts(folder)
@@ -82,7 +82,7 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
         summaries.write_summary(summary, folder / "summary.json")
     print_line(f"{write_report(folder, recording, FIGURE_FORMATS if all_formats else ())}")
     if as_pdf:
-        from twin.reports.pdf_report import write_pdf_report
+        from twin.report.pdf_report import write_pdf_report
 
         path = folder / "report.pdf"
         write_pdf_report(load_report_data(folder, recording), path)

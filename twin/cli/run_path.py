@@ -27,7 +27,7 @@ def _find_run(text: str, *, measured: bool) -> Path:
     path = Path(text)
     if text != LAST or path.exists():
         return path
-    from twin.reports.run_index import find_last_run
+    from twin.report.run_index import find_last_run
 
     folder = find_last_run(Path(), measured=measured)
     print(replace_escapes(f"last: {folder}"), file=sys.stderr)  # standard output may be JSON

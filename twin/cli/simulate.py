@@ -5,12 +5,12 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign.config import find_campaign
-from twin.reports.finalize import finalize_run
-from twin.run.folders import make_run_folder
-from twin.run.progress import RunProgress
-from twin.run.run_config import read_run_config
-from twin.run.terminal import console
-from twin.run.warm_up import compile_kernels
+from twin.report.finalize import finalize_run
+from twin.setup.folders import make_run_folder
+from twin.setup.run_config import read_run_config
+from twin.setup.warm_up import compile_kernels
+from twin.system.progress import RunProgress
+from twin.system.terminal import console
 
 
 def simulate_profile(
@@ -54,7 +54,7 @@ def simulate_profile(
 
 def _simulate_one(profile: Path, model: str | None, out: Path | None, view: bool) -> int:
     """Simulate one model at the profile's gap; return the exit code."""
-    from twin.run.unpaced import simulate_ideal as play
+    from twin.setup.unpaced import simulate_ideal as play
 
     config = read_run_config(profile, None, model)
     compile_kernels(config)

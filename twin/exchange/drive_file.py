@@ -23,8 +23,8 @@ import numpy as np
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.errors import InputError
-from twin.run.run_config import read_run_config
-from twin.run.terminal import print_line
+from twin.setup.run_config import read_run_config
+from twin.system.terminal import print_line
 
 CSV_HEADER = "time_s,drive_disp_mm"
 RPC_FRAME_POINTS = 1024

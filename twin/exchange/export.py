@@ -11,9 +11,9 @@ from table_io.errors import InputError, format_pip_line
 from table_io.records import RunStart
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
-from twin.run.recordings import open_recording
-from twin.run.rerun import restore_log
-from twin.run.terminal import error_console, print_line
+from twin.results.recordings import open_recording
+from twin.results.rerun import restore_log
+from twin.system.terminal import error_console, print_line
 
 # File suffix by format. The Foxglove layout is a second file.
 SUFFIXES = {

@@ -18,6 +18,7 @@ from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import Event, RunStart, RunStop, SampleGap
+from twin.compare.step_detection import DetectedSteps, find_steps
 from twin.exchange.columns import (
     ColumnMap,
     ImportColumns,
@@ -29,13 +30,12 @@ from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
 from twin.exchange.proposal import propose_map
 from twin.exchange.sampling import find_holes
-from twin.identification.step_detection import DetectedSteps, find_steps
-from twin.reports.finalize import EXIT_GAPS
-from twin.run.progress import RunProgress
-from twin.run.run_config import RunConfig, from_texts, make_run_id, read_model
-from twin.run.terminal import console, print_line
-from twin.run.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
-from twin.run.warm_up import compile_kernels
+from twin.report.finalize import EXIT_GAPS
+from twin.setup.run_config import RunConfig, from_texts, make_run_id, read_model
+from twin.setup.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
+from twin.setup.warm_up import compile_kernels
+from twin.system.progress import RunProgress
+from twin.system.terminal import console, print_line
 from twin.transport.codec import Item
 
 NO_PROFILE = (

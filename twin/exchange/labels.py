@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from table_io.block import Float1D, Int1D, Label
 from table_io.errors import InputError
 from table_io.records import Step
+from twin.compare.step_detection import DetectedSteps
 from twin.exchange.columns import ImportedSamples
 from twin.exchange.formats import SampleTable
-from twin.identification.step_detection import DetectedSteps
 from twin.recording.tabular import DIRECTION_SIGNS
 
 MAX_COUNT = 10**6  # of steps, and of cycles in a step

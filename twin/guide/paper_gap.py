@@ -10,9 +10,9 @@ from pathlib import Path
 
 import typer
 
+from twin.discovery.feature_labels import Json, label_feature, name_fit
 from twin.guide.reference import format_table
-from twin.reports.discovery.feature_labels import Json, label_feature, name_fit
-from twin.reports.quantities import format_quantity
+from twin.results.quantities import format_quantity
 
 RESULT_FILE = Path(__file__).with_name("paper_features.json")
 MAX_FITS = 8  # of the ranking

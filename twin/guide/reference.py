@@ -13,8 +13,8 @@ from table_io.config.key_reference import KeyDescription, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from twin.campaign.config import CampaignConfig
+from twin.discovery.features.config import FeatureSet
 from twin.exchange.columns import ColumnMap
-from twin.identification.features.config import FeatureSet
 from twin.model.config import ModelConfig
 from twin.studies.maps.config import StudyConfig
 

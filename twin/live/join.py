@@ -12,14 +12,14 @@ from twin.live.control import find_run
 from twin.live.process_config import INBOX_CAPACITY, MAX_QUIET_S, ProcessConfig
 from twin.live.recorder import FLUSH_INTERVAL_S, SYNC_INTERVAL_S, CompletionTracker
 from twin.recording.mcap_log import LogTimeError, LogWriter
+from twin.recording.merge_parts import LOCK_FILE, merge_run_parts
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.reports.finalize import EXIT_GAPS, EXIT_INTERRUPTED
-from twin.run.folders import RUNS_FOLDER, make_output_folder
-from twin.run.merge_parts import LOCK_FILE, merge_run_parts
-from twin.run.system import lock_file
-from twin.run.terminal import catch_interrupts, print_line
+from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
+from twin.setup.folders import RUNS_FOLDER, make_output_folder
+from twin.system.files import lock_file
+from twin.system.terminal import catch_interrupts, print_line
 from twin.transport.codec import TOPIC_TYPES, WireError, decode_item, encode_item, topic_for
 from twin.transport.endpoint import make_endpoint_error
 from twin.transport.reliable_subscriber import ReliableSubscriber

@@ -13,7 +13,7 @@ import numpy as np
 
 from table_io.clock import Clock, cpu_seconds
 from table_io.records import Timing
-from twin.run.run_config import RunConfig, from_texts
+from twin.setup.run_config import RunConfig, from_texts
 
 CONNECT_TIMEOUT_S = 15.0
 INBOX_CAPACITY = 50_000  # fragments queued in an inbox

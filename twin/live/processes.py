@@ -33,8 +33,8 @@ from twin.live.process_config import (
     request_realtime,
 )
 from twin.live.recorder import run_recorder
-from twin.run.diagnostics import configure_logging
-from twin.run.run_config import compile_rig_kernels
+from twin.setup.run_config import compile_rig_kernels
+from twin.system.diagnostics import configure_logging
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX
 from twin.transport.requests import RequestQueue

@@ -21,9 +21,9 @@ from twin.live.process_config import (
     process_token,
 )
 from twin.recording.mcap_log import LogTimeError, LogWriter
-from twin.run.disk import RESERVE_S, DiskForecast, DiskReserve, bytes_per_s, free_bytes
-from twin.run.merge_parts import LOCK_FILE
-from twin.run.system import lock_file
+from twin.recording.merge_parts import LOCK_FILE
+from twin.setup.disk import RESERVE_S, DiskForecast, DiskReserve, bytes_per_s, free_bytes
+from twin.system.files import lock_file
 from twin.transport.codec import TOPIC_TYPES, Item, WireError, decode_item, encode_item, topic_for
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_spoke

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 from table_io.clock import RealClock
 from twin.live.gateway import RequestServer, RunStatus
 from twin.live.process_config import LINGER_S, ProcessConfig
-from twin.run.run_config import RunConfig
-from twin.run.terminal import print_line
 from twin.security.access_control import build_open_access
 from twin.security.credentials import Credentials
+from twin.setup.run_config import RunConfig
+from twin.system.terminal import print_line
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, merge_settings
 from twin.transport.history_cache import MAX_CACHED_FRAGMENTS

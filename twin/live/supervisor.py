@@ -16,10 +16,10 @@ from table_io.config.profile import OnDeathConfig
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
 from twin.live.process_config import ProcessConfig, process_token
+from twin.recording.merge_parts import LOCK_FILE
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.run.merge_parts import LOCK_FILE
-from twin.run.system import lock_file
-from twin.run.temporary_folders import SOCKET_PREFIX, make_private_folder
+from twin.system.files import lock_file
+from twin.system.temporary_folders import SOCKET_PREFIX, make_private_folder
 from twin.transport.codec import RECORD_TOPICS, Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, check_can_listen
 from twin.transport.reliable_subscriber import ReliableSubscriber

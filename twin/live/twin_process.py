@@ -22,7 +22,7 @@ from twin.live.process_config import (
     request_realtime,
 )
 from twin.live.remote_twin import TWIN_TOPICS
-from twin.run.run_config import compile_twin_kernels
+from twin.setup.run_config import compile_twin_kernels
 from twin.transport.codec import Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import MEAS_TOPIC
 from twin.transport.reliable_subscriber import ReliableSubscriber

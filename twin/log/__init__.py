@@ -302,7 +302,7 @@ class Log:
         """Return the recording with the predictions; those not recorded are recomputed."""
         if self.start.has_all_predictions:
             return read_recording(self.path, (PRED_TOPIC,))
-        from twin.run.rerun import restore_predictions
+        from twin.results.rerun import restore_predictions
 
         return restore_predictions(read_recording(self.path))
 

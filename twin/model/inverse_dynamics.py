@@ -6,7 +6,7 @@
 Hidden states (hysteresis, relaxation) are carried along the measured motion from rest. Where
 contact was not measured the model decides: a face is touched while its force pushes. Along the
 motion every force is a smooth function of the parameters, even where trajectories are chaotic:
-this is what makes a fit converge (see `twin.identification`).
+this is what makes a fit converge (see `twin.discovery`).
 """
 
 import math

@@ -19,10 +19,10 @@ from twin.live.control import send_command
 from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.monitor.screen import COMMAND_KEYS, SILENT_S, draw_screen
-from twin.run.progress import RunProgress
-from twin.run.terminal import console, print_line
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
+from twin.system.progress import RunProgress
+from twin.system.terminal import console, print_line
 from twin.transport.codec import RECORD_TOPICS, Item, WireError, decode_item
 from twin.transport.endpoint import MEAS_TOPIC, STREAM_TOPICS, check_endpoint
 from twin.transport.reliable_subscriber import ReliableSubscriber

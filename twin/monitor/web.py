@@ -21,8 +21,6 @@ from twin.live.process_config import is_orphaned
 from twin.monitor.app import FRAME_S, LIVE_TOPICS, MonitorClient, connect_observer
 from twin.monitor.page_data import build_sections
 from twin.monitor.page_server import CommandAnswer, PageCommand, PageFeed, open_page_server
-from twin.run.diagnostics import configure_logging
-from twin.run.terminal import print_line, print_qr_code
 from twin.security.access_control import user_name
 from twin.security.credentials import (
     CERTIFICATE_FILE,
@@ -31,6 +29,8 @@ from twin.security.credentials import (
     read_credentials,
 )
 from twin.security.page_access import PageAccess, grant_page_access, is_loopback_host
+from twin.system.diagnostics import configure_logging
+from twin.system.terminal import print_line, print_qr_code
 from twin.transport.endpoint import PRED_TOPIC, split_host_port
 from twin.viewer.address import find_free_address
 

@@ -38,10 +38,10 @@ from twin.recording.reader import (
     read_start,
 )
 from twin.recording.recovery import recover_log
-from twin.run.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
-from twin.run.run_config import RunConfig
-from twin.run.unpaced import ItemHandler, record_items
-from twin.run.versions import read_installed_versions
+from twin.results.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
+from twin.setup.run_config import RunConfig
+from twin.setup.unpaced import ItemHandler, record_items
+from twin.system.versions import read_installed_versions
 from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
 from twin.transport.endpoint import CMP_TOPIC, HASH_TOPIC, PRED_TOPIC
 

@@ -15,8 +15,8 @@ from twin.model.config import ModelConfig
 from twin.model.ideal_response import simulate_sweep
 from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import RangeExit, select_first_exits
-from twin.reports import ideal_points
-from twin.reports.summary import Json
+from twin.results import ideal_points
+from twin.results.summary import Json
 from twin.studies.cases import StudyCase, build_cases
 from twin.studies.rows import Row, make_rows
 

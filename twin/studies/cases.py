@@ -12,7 +12,7 @@ from twin.model.config import ModelConfig
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
-from twin.run.run_config import read_model
+from twin.setup.run_config import read_model
 
 MAX_CASES = 10_000
 GAP_HELP = "allowed: a number of mm, inf for no bumpers, or FROM:TO:STEP in mm, as 0:30:2"

@@ -11,20 +11,20 @@ from table_io.clock import RealClock, local_datetime
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 from twin.model.valid_range import RangeKey
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.reports.summary import Json, write_json
-from twin.run.folders import make_run_folder
-from twin.run.progress import make_task_bar
-from twin.run.run_config import RunConfig, read_run_config
-from twin.run.tasks import Workers, order_results, run_tasks
-from twin.run.terminal import announce_if_slow, catch_interrupts, print_line
-from twin.run.versions import LIBRARIES
-from twin.run.warm_up import COMPILING_MESSAGE
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.results.summary import Json, write_json
+from twin.setup.folders import make_run_folder
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.warm_up import COMPILING_MESSAGE
 from twin.studies import TABLE_FILE
 from twin.studies.batch import Batch, CaseResult, read_batch, simulate_case
 from twin.studies.cases import StudyCase, parse_gaps_mm, read_models
 from twin.studies.page import write_study_page
 from twin.studies.rows import BatchTable
+from twin.system.process_pool import Workers, order_results, run_tasks
+from twin.system.progress import make_task_bar
+from twin.system.terminal import announce_if_slow, catch_interrupts, print_line
+from twin.system.versions import LIBRARIES
 
 MAX_ATTEMPTS = 3  # of a sweep whose worker dies
 RETRY_REMEDY = "remove the cause and simulate again; the rows before it are kept"

@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from twin.reports.plot_style import (
+from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     DIRECTION_DASHES,
     FREE_FLIGHT_COLOUR,
@@ -34,9 +34,9 @@ from twin.reports.plot_style import (
     guide_style,
     save_figures,
 )
-from twin.reports.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_panels, plot_prc
-from twin.reports.report_data import Curve
-from twin.reports.summary import Json
+from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_panels, plot_prc
+from twin.results.report_data import Curve
+from twin.results.summary import Json
 from twin.studies.cases import format_gap_mm
 from twin.studies.rows import Row
 

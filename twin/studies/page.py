@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import BaseModel
 
-from twin.reports.page import embed_images, render_page
-from twin.reports.summary import load_summary
+from twin.drawing.page import embed_images, render_page
+from twin.results.summary import load_summary
 from twin.studies import TABLE_FILE
 from twin.studies.cases import format_gap_mm
 from twin.studies.rows import read_batch_rows

@@ -9,6 +9,7 @@ from table_io.errors import InputError
 
 Settings = dict[str, Any]
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # at which observers reach a test
 MEAS_TOPIC = "/rig/meas"
 PRED_TOPIC = "/twin/pred"
 CMP_TOPIC = "/twin/cmp"

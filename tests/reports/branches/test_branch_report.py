@@ -9,12 +9,12 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.units import GRAVITY_M_S2
+from twin.branches.page import make_page_data, write_branch_report
+from twin.drawing.branch_curves import BranchSet, make_axis
 from twin.dynamics.continuation import Branch, continue_branch, split_by_stability
 from twin.dynamics.orbits import settle_to_orbit
 from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, make_period_map
-from twin.reports.branches.curves import BranchSet, make_axis
-from twin.reports.branches.page import make_page_data, write_branch_report
-from twin.run.run_config import read_run_config
+from twin.setup.run_config import read_run_config
 
 LIMITS_HZ = (2.5, 4.5)
 LEVEL_M_S2 = 0.05 * GRAVITY_M_S2

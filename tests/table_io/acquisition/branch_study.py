@@ -21,8 +21,8 @@ from table_io.config.rig import RigConfig
 from table_io.records import Event, OrbitPoint, RunStart, RunStop, Trip
 from table_io.sim.plant import Plant
 from tests.table_io.sim.plant_orbits import trace_orbits
-from twin.reports.orbits import find_measured_folds
-from twin.run.run_config import RunConfig, read_run_config
+from twin.results.orbits import find_measured_folds
+from twin.setup.run_config import RunConfig, read_run_config
 
 MASS_KG, STIFFNESS_N_M = 550.0, 36e3
 LEVEL_M_S2 = 0.05 * 9.80665

@@ -13,8 +13,8 @@ from table_io.config.folders import find_config
 from table_io.errors import InputError
 from table_io.records import Event
 from tests.table_io.backends.separate_processes import own_network
-from twin.cli.table import ExternalController, serve_table
 from twin.recording.reader import read_recording
+from twin.rig.table import ExternalController, serve_table
 
 pytest.importorskip("opendaq")
 PROGRAM = Path(sys.executable).parent / "shaketwin"

@@ -28,9 +28,9 @@ from tests.builders.truths import seal_truth
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log
-from twin.run.recordings import read_recorded_config
-from twin.run.run_config import read_run_config
-from twin.run.unpaced import play_unpaced
+from twin.results.recordings import read_recorded_config
+from twin.setup.run_config import read_run_config
+from twin.setup.unpaced import play_unpaced
 
 CARD, CARD_TOML = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})

@@ -19,7 +19,7 @@ import pytest
 from scipy import signal
 
 from table_io.sim.plant import Plant
-from tests.drive.hydraulic_rig import build_rig, play
+from tests.earthquakes.hydraulic_rig import build_rig, play
 
 A1B0, A2, A3, B1, B2 = 2.13e13, 4.23e6, 3.3, 425.0, 1e5
 SPECIMEN_KG, SPECIMEN_N_S_M, SPECIMEN_N_M = 29.1, 114.6, 1.19e6

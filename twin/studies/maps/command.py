@@ -11,13 +11,10 @@ from rich.progress import TextColumn
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.disk import format_size, free_bytes
-from twin.run.folders import claim_folder, find_sharing_problem, make_output_folder
-from twin.run.progress import make_task_bar
-from twin.run.run_config import make_run_id
-from twin.run.tasks import TaskResult, Workers, run_tasks
-from twin.run.terminal import catch_interrupts, console, print_line
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.disk import format_size, free_bytes
+from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
+from twin.setup.run_config import make_run_id
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.compute import (
     compute_chunk,
@@ -38,6 +35,9 @@ from twin.studies.maps.store import (
     require_same_study,
 )
 from twin.studies.maps.study import Study
+from twin.system.process_pool import TaskResult, Workers, run_tasks
+from twin.system.progress import make_task_bar
+from twin.system.terminal import catch_interrupts, console, print_line
 
 STOPPING_MESSAGE = "stopping after the chunks in progress"
 TRIAL_CASES = 4  # spread over the study, computed beforehand to estimate its duration

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from table_io.block import Float2D
 from table_io.errors import InputError
-from twin.run.versions import find_version_problem
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, SweepPlan
@@ -22,6 +21,7 @@ from twin.studies.maps.store import (
     read_study_versions,
 )
 from twin.studies.maps.study import Study
+from twin.system.versions import find_version_problem
 
 
 def make_sweep_plan(study: Study) -> SweepPlan:

@@ -22,7 +22,7 @@ from twin.dynamics.continuation import Branch
 from twin.dynamics.main_branches import follow_sweep_branches
 from twin.model.ideal_response import simulate_sweep
 from twin.model.stepped_sine import EXTREME_NAMES
-from twin.reports.ideal_points import ResponseScale, compute_ratios
+from twin.results.ideal_points import ResponseScale, compute_ratios
 from twin.studies.maps.cases import SampledCase
 
 ENTRY_POINT_GROUP = "shaketwin.outcomes"

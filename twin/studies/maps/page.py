@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float2D
-from twin.reports.page import embed_images, render_page
-from twin.run.system import is_folder_locked
+from twin.drawing.page import embed_images, render_page
 from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
 from twin.studies.maps.results import StudyResults, format_plain, format_unit
 from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
+from twin.system.files import is_folder_locked
 
 MAX_TABLE_CASES = 200_000  # in cases.csv
 MAX_FRONT_ROWS = 12  # of each front on the page

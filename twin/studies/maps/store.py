@@ -22,12 +22,12 @@ from table_io.block import Float2D
 from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
 from twin.model.effects import ENTRY_POINT_GROUP as EFFECT_GROUP
-from twin.run.folders import replace_text
-from twin.run.versions import find_version_problem, read_installed_versions
+from twin.setup.folders import replace_text
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study
+from twin.system.versions import find_version_problem, read_installed_versions
 
 RESULTS_FOLDER, MANIFEST_FILE = "results.zarr", "chunks.jsonl"
 DEFINITION_KEYS = {"study_toml", "profile_toml", "model_toml", "versions"}

@@ -12,7 +12,7 @@ from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.stepped_sine import validate_frequencies
-from twin.run.run_config import read_model
+from twin.setup.run_config import read_model
 from twin.studies.maps.cases import CaseFactory, SampledCase
 from twin.studies.maps.config import StudyConfig
 from twin.studies.maps.outcomes import Outcome, OutcomeVariable, find_outcome

@@ -5,14 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from twin.identification.cross_checks import fitted_gap
-from twin.identification.discover import PreparedLog, discover_effects, fit_known_effects
-from twin.identification.identify import identify_parameters
-from twin.identification.parameters import GapKey
+from twin.discovery.cross_checks import fitted_gap
+from twin.discovery.discover import PreparedLog, discover_effects, fit_known_effects
+from twin.discovery.identify import identify_parameters
+from twin.discovery.loading import load_logs, load_recordings
+from twin.discovery.parameters import GapKey
+from twin.discovery.serialize import interval_to_json, parameter_to_json, verdict_to_json
 from twin.model.model import Model
-from twin.reports.discovery.loading import load_logs, load_recordings
-from twin.reports.discovery.serialize import interval_to_json, parameter_to_json, verdict_to_json
-from twin.run.run_config import read_model_template
+from twin.setup.run_config import read_model_template
 
 
 def run_discovery(case_dir: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
 
 from table_io.block import Float1D, Float2D
-from twin.identification.screening import FOLD_COUNT
+from twin.discovery.screening import FOLD_COUNT
 from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]

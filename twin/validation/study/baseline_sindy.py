@@ -14,7 +14,7 @@ import numpy as np
 from pysindy.optimizers import STLSQ
 
 from table_io.block import Bool2D, Float1D, Float2D
-from twin.identification.screening import FOLD_COUNT
+from twin.discovery.screening import FOLD_COUNT
 from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]

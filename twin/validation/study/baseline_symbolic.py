@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D
-from twin.identification.screening import FOLD_COUNT
-from twin.identification.symbolic_regression import fit_regressor
+from twin.discovery.screening import FOLD_COUNT
+from twin.discovery.symbolic_regression import fit_regressor
 from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]

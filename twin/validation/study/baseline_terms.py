@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from twin.identification.discover import PreparedLog, prepare_problem
-from twin.identification.motion import MeasuredMotion
-from twin.identification.parameters import ParameterSet
-from twin.identification.residuals import FORCE_ROWS, LogResiduals
-from twin.identification.screening import assign_folds
+from twin.discovery.discover import PreparedLog, prepare_problem
+from twin.discovery.motion import MeasuredMotion
+from twin.discovery.parameters import ParameterSet
+from twin.discovery.residuals import FORCE_ROWS, LogResiduals
+from twin.discovery.screening import assign_folds
 from twin.model.model import Model
 
 Json = dict[str, Any]

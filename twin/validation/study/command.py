@@ -8,11 +8,11 @@ from typing import Any, TextIO
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.folders import claim_folder, find_sharing_problem, make_output_folder
-from twin.run.progress import make_task_bar
-from twin.run.tasks import Task, Workers, run_tasks
-from twin.run.terminal import catch_interrupts, print_line
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
+from twin.system.process_pool import Task, Workers, run_tasks
+from twin.system.progress import make_task_bar
+from twin.system.terminal import catch_interrupts, print_line
 from twin.validation.study.baselines import describe_missing
 from twin.validation.study.comparison_tables import CONTROL_TITLES
 from twin.validation.study.controls import CONTROL_CELLS, run_controls

@@ -8,7 +8,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.reports.plot_style import RC_PARAMS
+from twin.drawing.plot_style import RC_PARAMS
 
 
 def draw_confusion_matrix(

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from twin.identification.discover import PreparedLog, discover_effects
-from twin.identification.signals import LogSignals
+from twin.discovery.discover import PreparedLog, discover_effects
+from twin.discovery.serialize import verdict_to_json
+from twin.discovery.signals import LogSignals
 from twin.model.model import Model
-from twin.reports.discovery.serialize import verdict_to_json
 from twin.validation.study.adapter import load_case
 from twin.validation.study.comparison_tables import CONTROL_TITLES
 from twin.validation.study.generation import generate_case

@@ -19,22 +19,22 @@ import numpy as np
 from table_io.clock import cpu_seconds
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
-from twin.identification.discover import Discovery, discover_effects
-from twin.identification.experiment_design import rank_tests
-from twin.identification.law_search import LawProposal, propose_law
-from twin.reports.discovery.loading import load_logs
-from twin.reports.finalize import EXIT_INTERRUPTED
-from twin.run.decisive_test import (
+from twin.discovery.decisive_test import (
     CandidateTest,
     draw_random_test,
     list_candidate_tests,
     propose_tests,
 )
-from twin.run.folders import claim_folder, make_output_folder
-from twin.run.recordings import open_recording
-from twin.run.run_config import read_model_template
-from twin.run.tasks import Workers, run_tasks
-from twin.run.terminal import catch_interrupts, print_line
+from twin.discovery.discover import Discovery, discover_effects
+from twin.discovery.experiment_design import rank_tests
+from twin.discovery.law_search import LawProposal, propose_law
+from twin.discovery.loading import load_logs
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.results.recordings import open_recording
+from twin.setup.folders import claim_folder, make_output_folder
+from twin.setup.run_config import read_model_template
+from twin.system.process_pool import Workers, run_tasks
+from twin.system.terminal import catch_interrupts, print_line
 from twin.validation.study.generation import find_shares, hash_truth, make_truth, record_test
 from twin.validation.study.rates import Rate
 from twin.validation.study.rig_setup import MODEL_TOML, PROFILE_TOML, make_rig_toml

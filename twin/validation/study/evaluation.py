@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from table_io.clock import cpu_seconds
-from twin.reports.summary import dump_strict_json
+from twin.results.summary import dump_strict_json
 from twin.validation.study.adapter import (
     fit_true_structure,
     run_discovery,

@@ -27,7 +27,7 @@ from table_io.config.toml_text import format_toml
 from table_io.records import Record, RunStop
 from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
 from twin.recording.mcap_log import write_items
-from twin.run.run_config import RunConfig, from_texts
+from twin.setup.run_config import RunConfig, from_texts
 from twin.validation.study.amplitude_search import (
     BaselineResidual,
     apply_sensor_effect,

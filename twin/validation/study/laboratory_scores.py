@@ -20,7 +20,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from twin.identification.parameters import GAP_PREFIX
+from twin.discovery.parameters import GAP_PREFIX
 
 Json = dict[str, Any]
 SIZE_RATIO = 2.0  # of an instrument error named to the true one, either way

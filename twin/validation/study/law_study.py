@@ -25,18 +25,18 @@ from table_io.clock import RealClock, cpu_seconds
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
-from twin.identification.discover import prepare_problem
-from twin.identification.law_search import LawProposal, find_law_of_base
-from twin.identification.law_terms import LAW_PREFIX
-from twin.identification.localization import estimate_repeatability_floor
-from twin.identification.residuals import FORCE_ROWS, LogResiduals
-from twin.identification.selection import FittedSet
+from twin.discovery.discover import prepare_problem
+from twin.discovery.law_search import LawProposal, find_law_of_base
+from twin.discovery.law_terms import LAW_PREFIX
+from twin.discovery.localization import estimate_repeatability_floor
+from twin.discovery.residuals import FORCE_ROWS, LogResiduals
+from twin.discovery.selection import FittedSet
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model
 from twin.model.solver import OUTPUT_COUNT
 from twin.model.valid_range import find_range_exits
-from twin.run.tasks import Workers
-from twin.run.terminal import print_line
+from twin.system.process_pool import Workers
+from twin.system.terminal import print_line
 from twin.validation.study.adapter import load_case
 from twin.validation.study.baselines import describe_missing, find_baselines
 from twin.validation.study.command import open_study_folder, parse_cases, run_cases

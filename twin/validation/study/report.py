@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.reports.summary import dump_strict_json
+from twin.results.summary import dump_strict_json
 from twin.validation.study.comparison_tables import format_baseline_table, format_control_table
 from twin.validation.study.laboratory_report import (
     compute_laboratory_metrics,

@@ -1,0 +1,107 @@
+"""Short recordings of the simulated table, with something hidden in it, made ready for learning."""
+
+import hashlib
+import tempfile
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from table_io.acquisition.session import SessionSetup, run_session
+from table_io.backends import open_backend
+from table_io.block import Block
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.clock import ManualClock
+from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.records import RunStart
+from table_io.sim.config import SimulatedTableConfig
+from twin.discovery.discover import PreparedLog
+from twin.discovery.signals import LogSignals, build_signals
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+
+RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
+TRUE = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
+SNM = Model(TRUE)
+CELL_SHARE = 0.52  # of the right force in its first cell, and of the left one in its second
+ACC_GAIN = 1.008
+
+
+def profile(gap_mm: float = 4.0, start_hz: float = 1.4, stop_hz: float = 4.4) -> Profile:
+    """Up and back in a few steps, through flight, impacts and jumps."""
+    sweep = {"start_hz": start_hz, "stop_hz": stop_hz, "step_hz": 0.6, "cycles": 5}
+    return Profile.model_validate(
+        {
+            "title": "short",
+            "specimen": {"mass_kg": 550.0, "gap_mm": gap_mm},
+            "sweep": sweep,
+            "acquisition": {"rate_hz": 1000.0},
+            "loop_check": {"enabled": False},
+            "control": {"enabled": False},
+        }
+    )
+
+
+@cache
+def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Block, ...]:
+    """Measured blocks of a rig that hides a truth, with so many times the card's noise."""
+    sensors = [
+        sensor.model_copy(update={"noise_rms": sensor.noise_rms * noise}) for sensor in RIG.sensors
+    ]
+    simulated = RIG.get_section(SimulatedTableConfig)
+    assert simulated is not None
+    with tempfile.TemporaryDirectory() as folder:
+        if truth:
+            path = Path(folder) / "truth.toml"
+            path.write_text(truth)
+            sealed = hashlib.sha256(truth.encode()).hexdigest()
+            update = {"truth": str(path), "truth_sha256": sealed}
+            simulated = simulated.model_copy(update=update)
+        rig = RIG.model_copy(update={"sensors": tuple(sensors), "simulated": simulated})
+        clock, test = ManualClock(), profile(gap_mm)
+
+        def start(tare: dict[str, float], epoch_s: float) -> RunStart:
+            return RunStart(
+                0, "r", "n", "table", "", "", "", 1e3, 20, rig.channels, (), 0, tare, {}, "", "",
+                epoch_s,
+            )  # fmt: skip
+
+        source = run_session(
+            SessionSetup(test, rig), open_backend(rig, test, clock), clock, start, lambda: None
+        )
+        return tuple(item for item in source if isinstance(item, Block))
+
+
+def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog:
+    """The same, made ready."""
+    test = profile(gap_mm)
+    readings = build_signals(blocks(truth, noise, gap_mm), "short", 550.0, test.specimen.gaps_m)
+    return PreparedLog(readings, test.comparison.contact_n, test.sweep.steps)
+
+
+def distort(signals: LogSignals) -> LogSignals:
+    """Return the signals of a laboratory with shared loads and a gain of an accelerometer."""
+    spectra = dict(signals.spectra)
+    for cells, share in ((RIGHT_CELLS, CELL_SHARE), (LEFT_CELLS, 1.0 - CELL_SHARE)):
+        force = spectra[cells[0]] + spectra[cells[1]]
+        moved = (share - 0.5) * force
+        spectra |= {cells[0]: spectra[cells[0]] + moved, cells[1]: spectra[cells[1]] - moved}
+    spectra["mass_acc_m_s2"] = ACC_GAIN * spectra["mass_acc_m_s2"]
+    return replace(signals, spectra=spectra)
+
+
+@cache
+def imperfect_log(truth: str = "") -> PreparedLog:
+    """The same, of such a laboratory."""
+    prepared = log(truth)
+    return replace(prepared, signals=distort(prepared.signals))
+
+
+def format_truth(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:
+    """A sealed truth with one effect."""
+    lines = ["[[effects]]", f'id = "{effect}"']
+    lines += [f'channel = "{channel}"'] if channel else []
+    lines += [f'form = "{form}"'] if form else []
+    numbers = ", ".join(f"{name} = {value!r}" for name, value in parameters.items())
+    return "\n".join([*lines, f"parameters = {{ {numbers} }}", ""])

@@ -1,0 +1,48 @@
+"""Warnings of an identification on estimates that disagree."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from twin.discovery.cross_checks import SubsetEstimate, list_disagreements
+from twin.discovery.identify_page import format_estimate
+from twin.discovery.least_squares import FitResult
+from twin.discovery.motion import RecordScale
+from twin.discovery.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
+from twin.discovery.serialize import interval_to_json, parameter_to_json
+from twin.results.contracts import Interval
+from twin.results.summary import dump_contract
+
+KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
+
+
+def test_disagreements_come_in_the_order_of_the_parameters() -> None:
+    free = tuple(FreeParameter(key, -math.inf, math.inf, 1.0, "m") for key in KEYS)
+    joint = FitResult(
+        ParameterSet(dict.fromkeys(KEYS, 0.0), free), dict.fromkeys(KEYS, 0.0),
+        dict.fromkeys(KEYS, 1e-5), np.eye(len(KEYS)), 1.0, True, (),
+    )  # fmt: skip
+    apart = [
+        SubsetEstimate(source, dict.fromkeys(keys, (value, 1e-5)), 1000, True)
+        for source, value, keys in (("early", 0.0, KEYS), ("late", 1e-3, [*KEYS[::-1]][:-1]))
+    ]
+    scale = RecordScale(0.02, 0.2, 3.0, 1e-3, 1650.0, 5e-3, 2e-3, 25.0, {})
+    names = [text.split(":")[0] for text in list_disagreements(joint, apart, scale)]
+    assert names == [str(key) for key in KEYS[1:]]
+
+
+def test_too_few_cycles_give_no_interval() -> None:
+    few, many = KEYS[:2]
+    fit = FitResult(
+        ParameterSet({}), {}, {few: 5.0, many: 0.1}, np.eye(2), 1.0, True, (), (),
+        {few: 1.4, many: 12.0},
+    )  # fmt: skip
+    assert math.isinf(fit.interval_error(few))
+    assert fit.interval_error(many) == 0.1
+    estimate = interval_to_json(36e3, fit.interval_error(few), "N/m")
+    assert format_estimate(estimate) == "36.00 kN/m"
+    fitted = replace(fit, values={few: 36e3})
+    parameter = parameter_to_json(fitted, FreeParameter(few, 0.0, 1e6, 1.0, "N/m"))
+    limits = Interval.model_validate_json(dump_contract(Interval, parameter))
+    assert (limits.value, limits.low, limits.high) == (36e3, None, None)

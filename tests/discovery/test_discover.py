@@ -1,0 +1,434 @@
+"""Find, name, add, show: what is hidden in the simulated rig, in its own form, is named.
+
+The whole study is `shaketwin study discovery`; here stands one case of each kind of verdict.
+"""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from table_io.block import Int1D, Label
+from tests.discovery.played import SNM, format_truth, log
+from tests.input_errors import raises_input_error
+from tests.recovery.recordings import log_columns, oscillator
+from twin.discovery.candidates import Candidate, list_generic_candidates
+from twin.discovery.discover import (
+    Discovery,
+    PreparedLog,
+    discover_effects,
+    fit_known_effects,
+    prepare_problem,
+)
+from twin.discovery.parameters import EffectKey, TareKey
+from twin.discovery.screening import assign_folds, build_normal_equations, rank_candidates
+from twin.discovery.selection import (
+    Cancelled,
+    FittedSet,
+    SelectionProgress,
+    SelectionResult,
+    revise_step,
+)
+from twin.discovery.verdict import closed_fraction, judge_selection
+from twin.model.effects import EFFECTS
+
+
+@cache
+def discover(truth: str) -> Discovery:
+    """What is discovered in the recording that hides a truth; not to be changed."""
+    return discover_effects([log(truth)], SNM)
+
+
+def test_where_nothing_is_hidden_nothing_is_named() -> None:
+    discovery = discover_effects([log()], SNM)
+    assert discovery.verdict.outcome == "none"
+    assert discovery.verdict.best.effects == ()
+    assert discovery.selection.null.cost == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("truth", "key", "value"),
+    [
+        (format_truth("bumper_hardening", k2=3e7), EffectKey("bumper_hardening", "k2"), 3e7),
+        (format_truth("coulomb_friction", fc=30.0), EffectKey("coulomb_friction", "fc"), 30.0),
+        (format_truth("maxwell_damper", k1=8e3, tau=0.05), EffectKey("maxwell_damper", "k1"), 8e3),
+        (format_truth("gap_offset", offset=8e-5), EffectKey("gap_offset", "offset"), 8e-5),
+        (
+            format_truth("sensor_gain", "mass_acc_m_s2", gain=1.04),
+            EffectKey("sensor_gain", "gain", "mass_acc_m_s2"), 1.04,
+        ),
+    ],
+)  # fmt: skip
+def test_an_effect_is_named_with_its_parameter(truth: str, key: EffectKey, value: float) -> None:
+    discovery = discover(truth)
+    verdict = discovery.verdict
+    assert verdict.outcome == "named", verdict.reason
+    assert verdict.best.names == (".".join(filter(None, (key.effect, key.channel))),)
+    assert verdict.confidence > 0.9
+    assert verdict.best.fit.values[key] == pytest.approx(value, rel=0.05)
+    gap = closed_fraction(discovery.selection.null.cost, verdict.best.cost, verdict.floor)
+    assert gap > 0.95
+
+
+@pytest.mark.slow  # 4 s
+def test_two_effects_are_both_named() -> None:
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
+    verdict = discover_effects([log(truth)], SNM).verdict
+    assert verdict.outcome == "named"
+    assert {*verdict.best.names} == {"bumper_hardening", "coulomb_friction"}
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [
+        format_truth("cubic_damping", c3=3e4),
+        pytest.param(format_truth("quintic_bumper", coefficient=2e14), marks=pytest.mark.slow),
+        pytest.param(format_truth("position_friction", coefficient=5e3), marks=pytest.mark.slow),
+    ],
+)
+def test_what_is_not_in_the_library_is_unexplained(truth: str) -> None:
+    discovery = discover_effects([log(truth)], SNM)
+    assert discovery.verdict.outcome == "unexplained"
+    assert discovery.verdict.confidence <= 0.3 or not discovery.verdict.best.effects
+    assert discovery.verdict.generic is not None
+    alone = [each.cost for each in discovery.selection.generic_sets if len(each.effects) == 1]
+    if min(alone) < 1.1 * discovery.verdict.floor:
+        # with ideal instruments: their errors beside known laws say less
+        assert discovery.with_nuisances is discovery.ideal is None
+
+
+NEW_EFFECTS = [
+    ("stribeck_friction", {"fc": 10.0, "ratio": 6.0, "speed": 0.02}, "fc", 0.1),
+    ("position_damping", {"cu": 2e7}, "cu", 0.05),
+    ("appendage", {"mass": 5.0, "frequency": 6.0, "damping_ratio": 0.02}, "mass", 0.05),
+    ("bumper_cubic", {"kc": 2e9}, "kc", 0.05),
+]
+
+
+@pytest.mark.slow  # 4 s each
+@pytest.mark.parametrize(("effect", "planted", "parameter", "error"), NEW_EFFECTS)
+def test_a_law_with_shapes_or_states_is_named(
+    effect: str, planted: dict[str, float], parameter: str, error: float
+) -> None:
+    verdict = discover_effects([log(format_truth(effect, "", "", **planted))], SNM).verdict
+    assert verdict.outcome == "named", verdict.reason
+    assert verdict.best.names == (effect,)
+    value = verdict.best.fit.values[EffectKey(effect, parameter)]
+    assert value == pytest.approx(planted[parameter], rel=error)
+
+
+@pytest.mark.slow  # 4 s
+def test_a_bumper_that_pulls_is_named_though_it_acts_for_milliseconds() -> None:
+    discovery = discover_effects([log(format_truth("adhesion", force=60.0))], SNM)
+    assert discovery.verdict.outcome == "named", discovery.verdict.reason
+    assert discovery.verdict.best.names == ("adhesion",)
+    force = discovery.verdict.best.fit.values[EffectKey("adhesion", "force")]
+    assert force == pytest.approx(60.0, rel=0.05)
+    residuals = discovery.prepared.problem.log_residuals[0]
+    # the low pass smears the last sample of each release: a tenth of the squares remains
+    for name in ("right pull", "left pull"):
+        mask = residuals.entry_row == residuals.rows.index(name)
+        before = discovery.selection.null.held_out[0][mask]
+        after = discovery.verdict.best.held_out[0][mask]
+        assert np.mean(before**2) > 100.0
+        assert np.mean(after**2) < 0.15 * np.mean(before**2)
+
+
+def test_a_bumper_that_pulls_is_seen_without_adhesion_in_the_library() -> None:
+    truth = format_truth("adhesion", force=60.0)
+    discovery = discover_effects([log(truth)], SNM, without=("adhesion",))
+    assert discovery.verdict.outcome == "unexplained", discovery.verdict.reason
+    assert {"force_r1_n", "force_l1_n"} <= {*discovery.localization.channels}
+    assert discovery.localization.phase == "contact_both"
+    assert sum("bumper pulls" in note for note in discovery.notes) == 2
+
+
+def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
+    discovery = discover_effects([log(format_truth("bumper_hardening", k2=3e7), noise=28.0)], SNM)
+    assert discovery.selection.null.cost < 1.15  # of all rows together: as noise may be
+    assert discovery.verdict.outcome in ("named", "ambiguous")
+    assert "bumper_hardening" in discovery.verdict.best.names
+
+
+def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> None:
+    truth = format_truth("table_tilt", tilt=10.0) + format_truth("bumper_hardening", k2=3e7)
+    library = {"table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction"}
+    # with the whole library it takes a minute
+    without = [effect.id for effect in EFFECTS if effect.id not in library]
+    selection = discover_effects([log(truth, noise=20.0)], SNM, without=without).selection
+    assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
+    null, tilted = selection.null.cost, selection.tried[0].cost
+    assert tilted - selection.best.cost < 0.02 * (null - selection.best.cost)  # of all rows: minor
+
+
+def test_an_effect_that_only_stood_in_for_a_later_one_is_dropped() -> None:
+    """Friction is the nearest to a hysteresis, until the hysteresis itself is in the set."""
+    truth = format_truth("bouc_wen", force=60.0, yield_displacement=1e-3, exponent=1.0, beta=0.5)
+    prepared = prepare_problem([log(truth)], SNM)
+    problem = prepared.problem
+    library = {candidate.name: candidate for candidate in problem.library}
+    friction, hysteresis = library["coulomb_friction"], library["bouc_wen"]
+    null = problem.fit_effects(prepared.parameters, ())
+    first = problem.fit_effects(
+        friction.add_to(null.fit.parameters, friction.shapes[0]), [friction]
+    )
+    both = problem.fit_effects(
+        hysteresis.add_to(first.fit.parameters, hysteresis.shapes[0]), [friction, hysteresis]
+    )
+    assert first.cost < null.cost
+    assert both.cost < first.cost
+    state = SelectionResult(null, both, (first, both))
+    assert revise_step(problem, state, lambda _: None).best.names == ("bouc_wen",)
+
+
+def record_untared_damper(amplitude_m: float, seed: int) -> PreparedLog:
+    """A component test: spring, dashpot, 50 N of friction, a force cell that was not tared."""
+    rate_hz, frequency_hz, tare_n = 200.0, 2.0, 400.0
+    draw = np.random.default_rng(seed)
+    phase = 2 * np.pi * frequency_hz * np.arange(8 * rate_hz / frequency_hz) / rate_hz
+    u, v = amplitude_m * np.sin(phase), 2 * np.pi * frequency_hz * amplitude_m * np.cos(phase)
+    force = 1500.0 * u + 150.0 * v + 50.0 * np.sign(v) + tare_n
+    columns = {
+        "rel_disp_m": u + draw.normal(0.0, 2e-6, u.size),
+        "damper_force_n": force + draw.normal(0.0, 1.0, u.size),
+    }
+    return log_columns(f"{1e3 * amplitude_m:g} mm", rate_hz, columns)
+
+
+def test_a_channel_that_was_not_tared_hides_no_law() -> None:
+    logs = [record_untared_damper(size, seed) for seed, size in enumerate((2e-3, 5e-3, 10e-3))]
+    verdict = discover_effects(logs, oscillator(1e3, 1e2)).verdict
+    assert verdict.outcome == "named", verdict.reason
+    assert {*verdict.best.names} == {"sensor_offset.damper_force_n", "coulomb_friction"}
+    values = verdict.best.fit.values
+    assert values[EffectKey("coulomb_friction", "fc")] == pytest.approx(50.0, rel=0.05)
+    offset = values[EffectKey("sensor_offset", "offset", "damper_force_n")]
+    assert offset == pytest.approx(400.0, rel=0.02)
+
+
+def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
+    prepared = log(format_truth("coulomb_friction", fc=30.0))
+    discovery = discover_effects(
+        [prepared], SNM, without=("coulomb_friction", "bouc_wen", "stribeck_friction")
+    )
+    assert discovery.verdict.outcome == "unexplained"
+
+
+def test_the_place_of_the_disagreement() -> None:
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    assert discovery.localization.phase == "contact_both"
+    assert "force_r1_n" in discovery.localization.channels
+    one_sided = discover_effects([log(format_truth("sensor_gain", "force_l1_n", gain=1.1))], SNM)
+    assert one_sided.localization.phase == "contact_left"
+    assert sum(cell.excess * cell.count for cell in discovery.map_after) < 0.1 * sum(
+        cell.excess * cell.count for cell in discovery.map_before
+    )
+
+
+def test_a_motion_without_steps_has_a_place_too() -> None:
+    """In flight, and within the band in which the table was driven."""
+    prepared = log(format_truth("cubic_stiffness", k3=3e8))
+    driven = [step.frequency_hz for step in prepared.steps]
+    nowhere = np.full(prepared.signals.step.size, -1)
+    discovery = discover_effects(
+        [PreparedLog(replace(prepared.signals, step=nowhere), prepared.contact_n)], SNM
+    )
+    assert discovery.localization.frequency_hz is not None
+    low, high = discovery.localization.frequency_hz
+    assert 0.8 * min(driven) < low < high < 3.5 * max(driven)  # with the third harmonic
+    assert discovery.localization.channels == ("mass_acc_m_s2",)
+    assert discovery.localization.direction == "both"
+
+
+def test_where_several_sets_do_as_well_what_they_share_is_named() -> None:
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, bench = discovery.selection, discovery.prepared.problem
+    some = [effect for effect in bench.library if effect.name in ("gap_drift", "table_tilt")]
+    sets = [replace(named.best, effects=(*named.best.effects, effect)) for effect in some]
+    also = replace(named, best=sets[0], tried=(named.best, *sets))
+    verdict = judge_selection(bench, also, 1.0)
+    assert (verdict.outcome, verdict.best.names) == ("named", ("bumper_hardening",))
+    assert verdict.has_remainder
+    assert all(effect.name in verdict.reason for effect in some)
+    apart = [
+        replace(named.best, effects=(effect,)) for effect in some
+    ]  # and nothing where they share it
+    assert (
+        judge_selection(bench, replace(named, best=apart[0], tried=tuple(apart)), 1.0).outcome
+        == "ambiguous"
+    )
+
+
+@pytest.mark.parametrize(
+    ("place", "excess", "outcome"),
+    [("damper", 0.0, "unexplained"), ("damper", 0.1, "named"), ("bumper", 0.0, "named")],
+)
+def test_one_generic_term_elsewhere_that_leaves_but_noise_is_believed(
+    place: str, excess: float, outcome: str
+) -> None:
+    """Of a large misfit a wrong effect may leave little, too little for a share of it to tell.
+
+    A term in the same place may be another form of the effect.
+    """
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, problem = discovery.selection, discovery.prepared.problem
+    (exact,) = named.best.held_out
+    draw = np.random.default_rng(1)
+
+    def make_set(effects: tuple[Candidate, ...], mean_square: float) -> FittedSet:
+        rest = draw.normal(0.0, math.sqrt(mean_square), exact.size)
+        fit = replace(named.best.fit, held_out=(exact + rest,))
+        return replace(named.best, effects=effects, fit=fit)
+
+    null, wrong = make_set((), 60.0), make_set(named.best.effects, 0.3)
+    terms = list_generic_candidates(problem.log_residuals)
+    term = next(each for each in terms if each.name.split(".", 1)[1].startswith(place))
+    generic = make_set((term,), excess)
+    selection = replace(named, null=null, best=wrong, tried=(wrong,), generic_sets=(generic,))
+    verdict = judge_selection(problem, selection, named.best.cost)
+    assert verdict.outcome == outcome
+    assert (verdict.generic is generic) == (outcome == "unexplained")
+
+
+@pytest.mark.slow  # 5 s
+def test_several_logs_count_together() -> None:
+    truth = format_truth("bumper_hardening", k2=1e7)
+    both = discover_effects([log(truth), log(truth, gap_mm=2.0)], SNM).verdict
+    alone = discover_effects([log(truth)], SNM).verdict
+    assert both.best.names == alone.best.names == ("bumper_hardening",)
+    key = EffectKey("bumper_hardening", "k2")
+    assert both.best.fit.std_errors[key] < alone.best.fit.std_errors[key]
+
+
+def test_short_logs_are_enough_together() -> None:
+    """None of them has nine cycles or 1,000 samples of its own."""
+    whole = log("")
+    moving = np.flatnonzero(whole.signals.label != Label.REST)
+    pieces = [shorten(whole, piece) for piece in np.array_split(moving, 24)[4:20:2]]
+    with raises_input_error(where=pieces[0].signals.name, allowed="9 cycles"):
+        prepare_problem(pieces[:1], SNM)
+    with raises_input_error(allowed="in all logs together"):
+        prepare_problem(pieces[:2], SNM)
+    prepared = prepare_problem(pieces, SNM)
+    assert prepared.first_fit.converged
+
+
+def test_a_log_with_a_sensor_off_its_range_throughout_is_refused() -> None:
+    whole = log()
+    signals = replace(whole.signals, good=np.zeros_like(whole.signals.good))
+    with raises_input_error(where=signals.name, allowed="at least 1000"):
+        discover_effects([replace(whole, signals=signals)], SNM)
+
+
+def shorten(whole: PreparedLog, samples: Int1D) -> PreparedLog:
+    """The log with only these samples usable."""
+    good = np.zeros_like(whole.signals.good)
+    good[samples] = whole.signals.good[samples]
+    return replace(whole, signals=replace(whole.signals, good=good))
+
+
+def test_where_too_much_is_recorded_the_last_cycles_say_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    truth = format_truth("bumper_hardening", k2=3e7)
+    whole = prepare_problem([log(truth)], SNM).problem.log_residuals[0]
+    monkeypatch.setattr(
+        "twin.discovery.residuals.MAX_SAMPLES", int(whole.motion().moving.sum()) // 2
+    )
+    discovery = discover_effects([log(truth)], SNM)
+    (thin,) = discovery.prepared.problem.log_residuals
+    assert thin.entry_row.size < 0.6 * whole.entry_row.size
+    m = thin.motion()
+    for step in np.unique(m.step[m.step >= 0]):
+        cycles = np.unique(m.cycle[thin.row_mask[0] & (m.step == step) & (m.cycle >= 0)])
+        held = m.cycle[m.step == step].max() + 1
+        assert cycles.tolist() == list(range(held - max(held // thin.thinning, 2), held))
+    assert discovery.verdict.best.names == ("bumper_hardening",)
+    assert discovery.verdict.best.fit.values[EffectKey("bumper_hardening", "k2")] == pytest.approx(
+        3e7, rel=0.05
+    )
+    assert any("only the last are used" in note for note in discovery.notes)
+
+
+def test_linear_algebra_foresees_what_a_refit_finds() -> None:
+    prepared = prepare_problem([log(format_truth("coulomb_friction", fc=5.0))], SNM)
+    bench = prepared.problem
+    equations = build_normal_equations(bench.log_residuals, prepared.parameters, bench.library)
+    (best,) = rank_candidates(equations, 1)
+    assert best.candidate.name == "coulomb_friction"
+    refitted = bench.fit_effects(best.add_to(prepared.parameters), [best.candidate])
+    entries = sum(residual.size for residual in refitted.held_out)
+    assert best.cost / entries == pytest.approx(refitted.cost, rel=0.02)
+    assert equations.base_cost / entries == pytest.approx(
+        bench.fit_effects(prepared.parameters, ()).cost, rel=1e-3
+    )
+
+
+def test_no_step_is_judged_by_a_fit_that_saw_it() -> None:
+    """A fold's fit does not change with the samples that it holds out."""
+    prepared = prepare_problem([log()], SNM)
+    (sheet,) = prepared.problem.log_residuals
+    fold = assign_folds(sheet)
+    steps = sheet.signals.step[sheet.entry_sample]
+    held = steps >= 0
+    for number in np.unique(steps[held]):
+        assert np.unique(fold[held & (steps == number) & (fold >= 0)]).size == 1
+
+
+def test_the_oracle_is_not_far_better() -> None:
+    prepared = log(format_truth("maxwell_damper", k1=8e3, tau=0.05))
+    oracle = fit_known_effects([prepared], SNM, ["maxwell_damper"])
+    assert oracle is not None
+    assert discover_effects([prepared], SNM).verdict.best.cost <= 1.05 * oracle.cost
+
+
+def test_whoever_has_enough_keeps_what_was_found() -> None:
+    reports: list[SelectionProgress] = []
+
+    def tell(progress: SelectionProgress) -> None:
+        reports.append(progress)
+        if progress.index == 2:
+            raise Cancelled
+
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
+    discovery = discover_effects([log(truth)], SNM, tell)
+    assert not discovery.selection.complete
+    best = reports[-1].best  # of the two that it knew then: the model alone, and the first name
+    assert best is not None
+    assert best.names == reports[-2].names
+    kept = discovery.verdict.best  # `best` with wider intervals: a second effect is still missing
+    assert kept is not None
+    assert (kept.names, kept.cost) == (best.names, best.cost)
+    assert best.cost < discovery.selection.null.cost
+
+
+def test_whoever_stops_in_a_swap_keeps_what_was_added() -> None:
+    reports: list[SelectionProgress] = []
+
+    def tell(progress: SelectionProgress) -> None:
+        reports.append(progress)
+        if "replacing" in progress.stage:
+            raise Cancelled
+
+    truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
+    discovery = discover_effects([log(truth)], SNM, tell)
+    best = reports[-1].best
+    assert best is not None
+    assert len(best.effects) == 2
+    assert discovery.selection.best is best
+
+
+def test_a_rival_that_needs_a_tare_off_beyond_all_doubt_is_none() -> None:
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    named, bench = discovery.selection, discovery.prepared.problem
+    other = next(effect for effect in bench.library if effect.name == "gap_drift")
+    as_good = replace(named.best, effects=(other,))  # the very same residual under another name
+    assert judge_selection(bench, replace(named, tried=(as_good,)), 1.0).outcome == "ambiguous"
+    strained = replace(as_good, fit=replace(as_good.fit, at_bound=(TareKey(0, "u"),)))
+    assert judge_selection(bench, replace(named, tried=(strained,)), 1.0).outcome == "named"
+    turned = judge_selection(
+        bench, replace(named, best=strained, tried=(strained, named.best)), 1.0
+    )
+    assert (turned.outcome, turned.best) == ("named", named.best)  # whichever came first

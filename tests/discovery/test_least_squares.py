@@ -1,0 +1,134 @@
+"""The search for parameters on problems whose answer is known in closed form."""
+
+import math
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import cast
+
+import numpy as np
+import pytest
+
+from table_io.block import Float1D, Int1D
+from twin.discovery.least_squares import FitResult, fit_parameters
+from twin.discovery.parameters import BaseKey, FreeParameter, ParameterSet
+from twin.discovery.residuals import LogResiduals
+
+COUNT, BLOCK = 600, 20
+Left = Callable[[float, float], Float1D]
+
+
+A, B = BaseKey("a"), BaseKey("b")
+
+
+class Toy:
+    """What a fit asks of a sheet, for a residual of two numbers."""
+
+    log_number, rows, weight = 0, ("only",), 1.0
+
+    def __init__(self, left: Left) -> None:
+        self.left = left
+        self.entry_row: Int1D = np.zeros(COUNT, dtype=np.int64)
+        self.entry_contact_block: Int1D = np.arange(COUNT) // BLOCK
+
+    def evaluate(self, parameters: ParameterSet) -> Float1D:
+        return self.left(parameters.values[A], parameters.values[B])
+
+
+def free(
+    key: BaseKey, low: float = -math.inf, high: float = math.inf, vanishing: float | None = None
+) -> FreeParameter:
+    return FreeParameter(key, low, high, 1.0, "", vanishing=vanishing)
+
+
+def fit_sheet(
+    left: Left, a: FreeParameter, b: FreeParameter, folds: tuple[Int1D, ...] = ()
+) -> FitResult:
+    sheet = cast(LogResiduals, Toy(left))
+    return fit_parameters([sheet], ParameterSet({A: 0.5, B: 0.5}, (a, b)), folds=folds)
+
+
+@pytest.mark.parametrize("alike", [0.9, 0.999, 0.99999])
+def test_beside_a_number_at_its_bound_the_others_are_found(alike: float) -> None:
+    """a would go to 5 and may not: b is then what least squares says for a = 1."""
+    draw = np.random.default_rng(1)
+    first = draw.standard_normal(COUNT)
+    other = alike * first + math.sqrt(1 - alike**2) * draw.standard_normal(COUNT)
+    y = 5.0 * first - 3.0 * other + 0.01 * draw.standard_normal(COUNT)
+    fit = fit_sheet(lambda a, b: a * first + b * other - y, free(A, high=1.0), free(B))
+    assert fit.converged
+    assert fit.at_bound == (A,)
+    assert fit.values[A] == 1.0
+    assert fit.values[B] == pytest.approx(float(other @ (y - first) / (other @ other)), rel=1e-6)
+
+
+def test_what_is_left_out_is_judged_by_a_fit_and_not_by_a_leap() -> None:
+    """Two numbers nearly alike, in a law that explodes: an undamped step goes far along both."""
+    draw = np.random.default_rng(2)
+    x, noise = np.linspace(1, 2, COUNT), draw.standard_normal(COUNT)
+    fold = np.arange(COUNT) % 3
+
+    def compute_residuals(a: float, b: float) -> Float1D:
+        apart = np.expm1(np.clip(40 * (a - b), -300, 300)) - 40 * (a - b)
+        return (a + b) * x + 1e-4 * (a - b) * x**2 + 1e-3 * apart - (2.0 * x + noise)
+
+    (out,) = fit_sheet(compute_residuals, free(A), free(B), (fold,)).held_out
+    assert 1.0 < float(out @ out) / float(noise @ noise) < 1.05
+
+
+def test_an_amplitude_that_only_one_fold_says_gains_nothing_there() -> None:
+    """Junk in the last fold alone: who saw it explains it, who did not must not."""
+    draw = np.random.default_rng(4)
+    x, noise = np.linspace(1, 2, COUNT), draw.standard_normal(COUNT)
+    fold = np.arange(COUNT) * 3 // COUNT
+    junk = np.where(fold == 2, 5.0 * np.sign(draw.standard_normal(COUNT)), 0.0)
+
+    def out(amplitude: FreeParameter) -> Float1D:
+        fit = fit_sheet(lambda a, b: a * x - b * junk - (2.0 * x + noise - junk), free(A),
+                       amplitude, (fold,))  # fmt: skip
+        return fit.held_out[0]
+
+    mine = fold == 2
+    nothing = fit_sheet(lambda a, b: a * x - (2.0 * x + noise - junk), free(A), free(B), (fold,))
+    assert float((out(free(B, vanishing=0.0))[mine] ** 2).mean()) > 20.0
+    assert out(free(B, vanishing=0.0))[mine] == pytest.approx(nothing.held_out[0][mine], abs=0.05)
+    # what is not an effect's stays as it is: whatever is compared has it
+    assert float((out(free(B))[mine] ** 2).mean()) < 2.0
+
+
+def test_what_stands_at_its_bound_makes_the_others_no_less_sure() -> None:
+    draw = np.random.default_rng(5)
+    first = draw.standard_normal(COUNT)
+    other = 0.99 * first + 0.14 * draw.standard_normal(COUNT)
+    y = 5.0 * first - 3.0 * other + draw.standard_normal(COUNT)
+    stuck = fit_sheet(lambda a, b: a * first + b * other - y, free(A, high=1.0), free(B))
+    fixed = fit_sheet(lambda a, b: first + b * other - y, free(A), free(B))
+    assert stuck.std_errors[B] == pytest.approx(fixed.std_errors[B], rel=1e-3)
+    assert stuck.std_errors[A] == 0.0
+
+
+def test_columns_taken_side_by_side_are_the_same() -> None:
+    draw = np.random.default_rng(6)
+    x, y = draw.standard_normal((2, COUNT)), draw.standard_normal(COUNT)
+    sheet = cast(LogResiduals, Toy(lambda a, b: a * x[0] + np.tanh(b * x[1]) - y))
+    start = ParameterSet({A: 0.5, B: 0.5}, (free(A), free(B)))
+    alone = fit_parameters([sheet], start)
+    with ThreadPoolExecutor(2) as pool:
+        beside = fit_parameters([sheet], start, mapper=pool.map)
+    assert alone.values == beside.values
+    assert alone.std_errors == beside.std_errors
+
+
+def test_without_a_number_to_find_there_is_a_fit_too() -> None:
+    sheet = cast(LogResiduals, Toy(lambda a, b: np.full(COUNT, 2.0)))
+    assert fit_parameters([sheet], ParameterSet({A: 0.5, B: 0.5})).cost == 4.0
+
+
+def test_a_fold_that_says_as_much_as_the_others_is_judged_as_least_squares_does() -> None:
+    draw = np.random.default_rng(3)
+    x, y = draw.standard_normal((2, COUNT)), draw.standard_normal(COUNT)
+    fold = np.arange(COUNT) % 3
+    (out,) = fit_sheet(lambda a, b: a * x[0] + b * x[1] - y, free(A), free(B), (fold,)).held_out
+    for k in range(3):
+        mine = fold == k
+        best = np.linalg.lstsq(x[:, ~mine].T, y[~mine], rcond=None)[0]
+        assert out[mine] == pytest.approx(best @ x[:, mine] - y[mine], abs=1e-6)

@@ -1,0 +1,168 @@
+"""Small errors of instruments and set-up: found as such, and no effect of the specimen."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from tests.discovery.played import (
+    ACC_GAIN,
+    CELL_SHARE,
+    SNM,
+    TRUE,
+    format_truth,
+    imperfect_log,
+    log,
+)
+from twin.discovery.discover import (
+    PreparedProblem,
+    add_nuisances,
+    discover_effects,
+    explain_with_nuisances,
+    prepare_problem,
+)
+from twin.discovery.nuisances import (
+    MAX_SIZE,
+    TYPICAL_GAIN,
+    TYPICAL_SHARE,
+    correct_signals,
+    linearize_nuisances,
+    list_nuisances,
+    sensor_mask,
+)
+from twin.discovery.parameters import DAMPING, STIFFNESS, NuisanceKey
+from twin.discovery.residuals import Nuisance
+from twin.discovery.selection import MAX_EXPLAINED_COST
+
+
+@cache
+def explain_imperfect_log() -> PreparedProblem:
+    return explain_with_nuisances(prepare_problem([imperfect_log()], SNM))
+
+
+def nuisance_values(prepared: PreparedProblem) -> Mapping[NuisanceKey, float]:
+    """Return the nuisances of the first log in typical sizes."""
+    terms = prepared.problem.log_residuals[0].nuisances
+    assert terms is not None
+    values = terms.centre + terms.values(prepared.parameters)
+    return dict(zip(terms.keys, map(float, values), strict=True))
+
+
+def test_a_usual_laboratory_is_explained_by_its_instruments() -> None:
+    assert prepare_problem([imperfect_log()], SNM).first_fit.cost > 2.0
+    prepared = explain_imperfect_log()
+    assert prepared.first_fit.cost < MAX_EXPLAINED_COST
+    values = nuisance_values(prepared)
+    share = (CELL_SHARE - 0.5) / TYPICAL_SHARE
+    assert values[NuisanceKey(0, "share", "right")] == pytest.approx(share, rel=0.1)
+    assert values[NuisanceKey(0, "share", "left")] == pytest.approx(-share, rel=0.1)
+    gain = (ACC_GAIN - 1.0) / TYPICAL_GAIN
+    assert values[NuisanceKey(0, "gain", "mass_acc_m_s2")] == pytest.approx(gain, abs=0.3)
+
+
+def test_its_parameters_are_those_of_the_specimen() -> None:
+    fit = explain_imperfect_log().first_fit
+    for key, true in ((STIFFNESS, TRUE.stiffness), (DAMPING, TRUE.damping)):
+        assert fit.values[key] == pytest.approx(true, rel=0.01)
+        assert abs(fit.values[key] - true) < 4.0 * fit.std_errors[key]
+
+
+def test_no_effect_is_named_in_it() -> None:
+    verdict = discover_effects([imperfect_log()], SNM).verdict
+    assert verdict.outcome == "none"
+    assert verdict.best.effects == ()
+
+
+@pytest.mark.slow
+def test_an_effect_is_named_in_it_with_its_parameter() -> None:
+    truth = format_truth("bumper_hardening", k2=3e7)
+    verdict = discover_effects([imperfect_log(truth)], SNM).verdict
+    assert verdict.outcome == "named"
+    assert verdict.best.names == ("bumper_hardening",)
+    (k2,) = verdict.best.effects[0].free
+    assert verdict.best.fit.values[k2.key] == pytest.approx(3e7, rel=0.05)
+
+
+def test_a_fault_of_one_cell_is_named() -> None:
+    """A gain of 5 % is no error that every laboratory has."""
+    truth = format_truth("sensor_gain", "force_r1_n", gain=1.05)
+    verdict = discover_effects([log(truth)], SNM).verdict
+    assert verdict.outcome == "named"
+    assert verdict.best.names == ("sensor_gain.force_r1_n",)
+    assert verdict.best.fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.005)
+
+
+def test_ideal_instruments_need_no_nuisances() -> None:
+    prepared = prepare_problem([log()], SNM)
+    assert explain_with_nuisances(prepared) is prepared
+
+
+def test_what_nuisances_cannot_explain_is_left_to_ideal_instruments() -> None:
+    prepared = prepare_problem([log(format_truth("bumper_hardening", k2=3e7))], SNM)
+    assert explain_with_nuisances(prepared) is prepared
+
+
+@pytest.mark.parametrize(
+    "kind_and_place",
+    [
+        ("gain", "right"), ("gain", "table_acc_m_s2"), ("lag", "mass_acc_m_s2"),
+        ("resonance", "mass_acc_m_s2"), ("offset1", "mass_disp_m"),
+        ("chebyshev3", "table_disp_m"), ("share", "left"), ("plate", "right"),
+        ("cross", "mass_acc_m_s2"), ("gap", ""),
+    ],
+)  # fmt: skip
+def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str]) -> None:
+    """Signals corrected by one typical size change the residual by the column."""
+    problem = prepare_problem([log(noise=0.2)], SNM)
+    parameters = problem.parameters
+    residuals = linearize_nuisances(problem.problem.log_residuals[0], parameters)
+    terms = residuals.nuisances
+    assert terms is not None
+    number = [(nuisance.kind, nuisance.place) for nuisance in terms.nuisances].index(kind_and_place)
+    bare = replace(residuals, nuisances=None, motion_cache=[])
+    corrected = correct_signals(residuals.signals, terms.nuisances[number], 1.0)
+    before = bare.evaluate_rows(parameters, residuals.signals.fuse_motion())
+    change = bare.evaluate_rows(parameters, corrected.fuse_motion()) - before
+    difference = change - terms.columns[number]
+    assert math.sqrt(np.mean(difference**2)) < 0.2 * math.sqrt(np.mean(change**2))
+
+
+def test_a_prior_holds_every_nuisance() -> None:
+    """Its entries are the values, and its bounds those of a typical error."""
+    prepared = add_nuisances(prepare_problem([log()], SNM), 1.0)
+    residuals = prepared.problem.log_residuals[0]
+    values = nuisance_values(prepared)
+    entries = residuals.evaluate(prepared.parameters)[-len(values) :]
+    assert entries == pytest.approx([*values.values()])
+    assert all(abs(value) <= MAX_SIZE for value in values.values())
+    assert not sensor_mask(residuals)[0]  # the damper row
+    assert sensor_mask(residuals)[-1]
+
+
+def test_what_nothing_contradicts_is_no_nuisance() -> None:
+    """The scales of all displacements and of all forces are fixed."""
+    nuisances = list_nuisances(log().signals)
+    places = {nuisance.place for nuisance in nuisances if nuisance.kind == "gain"}
+    assert places == {"table_disp_m", "mass_acc_m_s2", "table_acc_m_s2", "right", "left"}
+    assert all(isinstance(nuisance, Nuisance) and nuisance.size > 0 for nuisance in nuisances)
+
+
+def test_a_low_cut_is_restored_where_the_mass_accelerates_and_no_slow_noise_grows() -> None:
+    """A low cut of 0.4 Hz takes a third of a motion at 0.8 Hz; below 0.1 Hz there is only noise."""
+    signals = log().signals
+    cut = 2.0 * math.pi * 0.4
+    through = 1j * signals.omega / (1j * signals.omega + cut)
+    read = signals.spectra["mass_acc_m_s2"] * through
+    distorted = replace(signals, spectra={**signals.spectra, "mass_acc_m_s2": read})
+    restored = correct_signals(distorted, Nuisance("low_cut", "mass_acc_m_s2", cut), 1.0)
+    gain = np.abs(restored.spectra["mass_acc_m_s2"][1:] / read[1:])
+    hz = signals.omega[1:] / (2.0 * math.pi)
+    fast, slow = hz > 0.3, hz < 0.05
+    true = signals.spectra["mass_acc_m_s2"][1:][fast]
+    error = restored.spectra["mass_acc_m_s2"][1:][fast] - true
+    assert np.linalg.norm(error) < 1e-3 * np.linalg.norm(true)
+    assert gain[slow].max() < 1.1
+    assert gain.max() < 5.0

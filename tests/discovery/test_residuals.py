@@ -1,0 +1,53 @@
+"""Residuals: at the samples that they use they are those of the whole motion."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from tests.discovery.played import SNM, format_truth, log
+from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet, TermKey
+from twin.discovery.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {EffectKey("cubic_stiffness", "k3"): 1e7},
+        {EffectKey("table_tilt", "tilt"): 0.1},
+        {EffectKey("bouc_wen", "force"): 1e2, EffectKey("bouc_wen", "yield_displacement"): 3e-3},
+        {EffectKey("bumper_maxwell", "kb"): 2e5, EffectKey("bumper_maxwell", "tau"): 0.05},
+        {TermKey("damper resonator", "force"): 10.0, TermKey("damper resonator", "width"): 3.0},
+    ],
+)
+def test_forces_at_the_used_samples_are_those_of_the_whole_motion(
+    values: Mapping[ParameterKey, float],
+) -> None:
+    prepared = log()
+    (residuals,) = build_log_residuals([(prepared.signals, prepared.contact_n)], SNM)
+    parameters = ParameterSet.from_model(SNM, 1).with_values(values)
+    m = residuals.motion()
+    whole = residuals.force_errors(parameters, m)
+    noise = residuals.force_noise(m, m.mass_kg)
+    rows = residuals.evaluate_rows(parameters, m)
+    entry_row = residuals.entry_row[: rows.size]
+    for row in range(len(FORCE_ROWS)):
+        expected = whole[row][residuals.row_mask[row]] / noise[row]
+        assert expected.size
+        np.testing.assert_array_equal(rows[entry_row == row], expected)
+
+
+def test_ringing_before_a_step_of_the_force_is_neither_contact_nor_tension() -> None:
+    """A dashpot in compression makes the force jump at touch; a band limit rings before it."""
+    prepared = log(format_truth("compression_dashpot", coefficient=3000.0))
+    (residuals,) = build_log_residuals([(prepared.signals, prepared.contact_n)], SNM)
+    least_samples = 0.02 * residuals.motion().rate_hz  # of an impact; a ringing lasts 2 ms
+    entries = residuals.evaluate(ParameterSet.from_model(SNM, 1))
+    for side, name in enumerate(PULL_ROWS):
+        changes = np.flatnonzero(np.diff(residuals.contact_state[side], prepend=0, append=0))
+        assert changes.size > 80
+        assert np.diff(changes)[::2].min() >= least_samples
+        pulls = entries[residuals.entry_row == residuals.rows.index(name)]
+        assert pulls.size > 200
+        assert np.mean(pulls**2) < 1.0

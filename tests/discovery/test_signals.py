@@ -1,0 +1,151 @@
+"""Motion from lasers and accelerometers, and what their disagreement says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from table_io.block import Block
+from table_io.errors import InputError
+from tests.discovery.played import TRUE, blocks, format_truth, log
+from twin.discovery.signals import build_signals
+from twin.model.inverse_dynamics import forces_along
+from twin.model.model import Model, SensorModel
+
+
+def test_velocity_is_that_of_the_displacement() -> None:
+    motion = log().signals.fuse_motion()
+    inside = motion.moving & (np.arange(motion.u.size) > 500)
+    slope = np.gradient(motion.u, 1.0 / motion.rate_hz)
+    error = (slope - motion.v)[inside]
+    assert np.sqrt(np.mean(error**2)) < 0.02 * np.sqrt(np.mean(motion.v[inside] ** 2))
+
+
+def test_the_fused_motion_is_better_than_the_laser_by_far() -> None:
+    """Against the same run without noise: the card's lasers have 5 um, their difference 7."""
+    noisy, clean = log(noise=4.0).signals.fuse_motion(), log(noise=1e-3).signals.fuse_motion()
+    error = (noisy.u - clean.u)[clean.moving]
+    assert 0 < error.std() < 0.5 * 4 * 7e-6
+    assert noisy.noise.u == pytest.approx(error.std(), rel=0.3)
+
+
+@pytest.mark.parametrize("noise", [1.0, 20.0])
+def test_sound_sensors_surprise_nobody(noise: float) -> None:
+    motion = log(noise=noise).signals.fuse_motion()
+    assert [residual.body for residual in motion.consistency_residuals] == [
+        "mass",
+        "table",
+        "right cells",
+        "left cells",
+    ]
+    for residual in motion.consistency_residuals:
+        assert np.mean(residual.values[motion.moving] ** 2) == pytest.approx(1.0, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("effect", "channel", "body"),
+    [
+        ("sensor_gain", "mass_acc_m_s2", "mass"),
+        ("sensor_gain", "table_disp_m", "table"),
+        ("sensor_gain", "force_l2_n", "left cells"),
+    ],
+)
+def test_the_gate_names_the_body_and_the_belief_closes_it(
+    effect: str, channel: str, body: str
+) -> None:
+    readings = log(format_truth(effect, channel, gain=1.05)).signals
+
+    def odd(sensors: tuple[SensorModel, ...]) -> dict[str, float]:
+        motion = readings.fuse_motion(sensors)
+        return {
+            residual.body: float(np.mean(residual.values[motion.moving] ** 2))
+            for residual in motion.consistency_residuals
+        }
+
+    before = odd(())
+    assert before[body] > 3.0
+    assert all(value < 1.3 for name, value in before.items() if name != body)
+    assert odd((SensorModel(channel, gain=1.05),))[body] == pytest.approx(1.0, abs=0.15)
+
+
+def test_no_force_law_breaks_the_gate() -> None:
+    motion = log(format_truth("bumper_hardening", k2=1e8)).signals.fuse_motion()
+    for residual in motion.consistency_residuals:
+        assert np.mean(residual.values[motion.moving] ** 2) < 1.2
+
+
+def test_a_lag_is_taken_back() -> None:
+    late = log(format_truth("sensor_lag", "mass_acc_m_s2", lag=2e-3)).signals
+    sound = log().signals.fuse_motion()
+    mended = late.fuse_motion((SensorModel("mass_acc_m_s2", lag=2e-3),))
+    error = (mended.acc - sound.acc)[sound.moving]
+    was = (late.fuse_motion().acc - sound.acc)[sound.moving]
+    assert error.std() < 0.1 * was.std()
+
+
+@pytest.mark.parametrize("channel", ["mass_acc_m_s2", "table_disp_m", "force_r1_n"])
+@pytest.mark.parametrize("lag", [0.0, 2e-3])
+def test_an_assumed_sensor_gives_the_motion_of_its_corrected_readings(
+    channel: str, lag: float
+) -> None:
+    signals, gain, offset = log().signals, 1.02, 1e-3
+    sensor = SensorModel(channel, gain=gain, lag=lag, offset=offset)
+    tared = signals.spectra[channel] - offset * signals.unit_spectrum
+    spectrum = tared * np.exp(1j * signals.omega * lag) / gain
+    corrected = replace(signals, spectra={**signals.spectra, channel: spectrum})
+    expected = corrected.fuse_motion()
+    for motion in (signals.fuse_motion((sensor,)), signals.fuse_corrected(corrected)):
+        for name in ("u", "v", "acc", "table_acc", "table_disp", "right", "left"):
+            values, size = getattr(motion, name), float(np.abs(getattr(expected, name)).max())
+            np.testing.assert_allclose(values, getattr(expected, name), rtol=0, atol=1e-9 * size)
+        pairs = zip(motion.consistency_residuals, expected.consistency_residuals, strict=True)
+        for own, other in pairs:
+            assert own.body == other.body
+            np.testing.assert_allclose(own.values, other.values, rtol=0, atol=1e-6)
+
+
+def test_without_displacement_there_is_nothing_to_learn() -> None:
+    measured = blocks()[0]
+    place = measured.channels.index("mass_acc_m_s2")
+    poor = Block(
+        measured.stream, measured.index, measured.rate_hz, ("mass_acc_m_s2",),
+        measured.values[place : place + 1],
+        measured.step, measured.label, measured.cycle,
+    )  # fmt: skip
+    with pytest.raises(InputError) as error:
+        build_signals((poor,), "poor", 550.0, (0.002, 0.002))
+    assert error.value.where == "poor"
+    assert "rel_disp_m" in error.value.allowed
+
+
+def test_a_dead_channel_is_no_channel() -> None:
+    dead = []
+    for block in blocks():
+        values = block.values.copy()
+        values[block.channels.index("force_r1_n")] = 0.0
+        dead.append(
+            Block(
+                block.stream,
+                block.index,
+                block.rate_hz,
+                block.channels,
+                values,
+                block.step,
+                block.label,
+                block.cycle,
+            )
+        )
+    assert "force_r1_n" not in build_signals(tuple(dead), "dead", 550.0, (0.002, 0.002)).channels
+
+
+def test_along_a_motion_the_forces_are_those_of_the_law() -> None:
+    time = np.arange(500) / 500.0
+    u, v = 0.004 * np.sin(6.0 * time), 0.024 * np.cos(6.0 * time)
+    touched = np.array([u > 0.002, u < -0.002]).astype(np.int8)
+    model = Model(TRUE).with_effect("cubic_stiffness", k3=1e8)
+    damper, right, left = forces_along(model, u, v, 0 * u, time, touched)
+    np.testing.assert_allclose(damper, 36e3 * u + 1.1e3 * v + 1e8 * u**3, rtol=1e-12, atol=1e-9)
+    push = 510e3 * (u - 0.002) + 900.0 * v
+    np.testing.assert_allclose(right, np.where(u > 0.002, push, 0.0), rtol=1e-12, atol=1e-9)
+    pull = 510e3 * (u + 0.002) + 900.0 * v
+    np.testing.assert_allclose(left, np.where(u < -0.002, pull, 0.0), rtol=1e-12, atol=1e-9)

@@ -1,0 +1,1 @@
+"""Branches of periodic motions, their bifurcations and basins, as a page."""

@@ -1,0 +1,1 @@
+"""The demonstration: an effect hidden at random, found and unsealed."""

@@ -1,0 +1,217 @@
+"""Candidates of a selection: every effect of the library, sensor effects once per channel.
+
+Forces depend (nearly) linearly on the amplitude of a candidate, but not on its shape parameters.
+Each candidate therefore has a ladder of trial shapes; the fit interpolates between them.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+
+import numpy as np
+
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.discovery.generic_terms import list_term_parameters, list_terms
+from twin.discovery.motion import RecordScale
+from twin.discovery.parameters import (
+    GENERIC_PREFIX,
+    SLIP_SPEED,
+    FreeParameter,
+    ParameterKey,
+    ParameterSet,
+    list_effect_parameters,
+    measure_size,
+)
+from twin.discovery.residuals import LogResiduals
+from twin.model.effects import EFFECTS, load_plugins
+from twin.model.effects.effect import Effect, EffectParameter
+
+LADDER_LENGTH = 9
+# of the largest velocity: trial values; friction near zero velocity varies
+SLIP_SHARES = (5e-5, 1.5e-3, 5e-3, 1.5e-2)
+THRESHOLD_SHARES = (0.003, 0.01, 0.03, 0.1, 0.3)  # of its size: trial values of a threshold
+LADDER_SHARES = (0.01, 2.0)  # ends of the ladder of a length or speed, of the largest in the test
+MAX_LADDER_PERIODS = 6.0  # of the main motion: end of the ladder of a relaxation time or frequency
+RESONANCE_RATIO = 1.12  # between trial frequencies: about the width of a resonance of 5 % damping
+MAX_RESONANCE_SHARE = 0.1  # of the sampling rate: highest trial frequency
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """Candidate effect with a ladder of trial shapes.
+
+    `effect` is None for a generic term, which represents effects outside the library.
+    """
+
+    name: str
+    free: tuple[FreeParameter, ...]
+    amplitude: FreeParameter  # the one of `free` that makes the effect vanish
+    vanishing: float
+    shapes: tuple[tuple[float, ...], ...]  # trial values of the other parameters, in their order
+    effect: Effect | None = None
+    channel: str = ""
+    constants: Mapping[ParameterKey, float] = field(default_factory=dict)  # fixed values
+    # Deviations of the amplitude over which its slope is taken; 0: where it vanishes.
+    probes: tuple[float, ...] = (0.0,)
+
+    @classmethod
+    def from_effect(cls, effect: Effect, channel: str, scale: RecordScale) -> "Candidate":
+        """Return the candidate of a library effect; `channel` is that of a sensor effect."""
+        free = list_effect_parameters(effect, scale, channel)
+        shapes = _list_shapes(effect, free, scale)
+        index = next(
+            i for i, parameter in enumerate(effect.parameters) if parameter.vanishing is not None
+        )
+        vanishing = float(effect.parameters[index].vanishing or 0.0)
+        name = f"{effect.id}.{channel}" if channel else effect.id
+        amplitude = free[index]
+        if effect.is_dry_friction:
+            speeds = [share * scale.v for share in SLIP_SHARES]
+            slip = FreeParameter(
+                SLIP_SPEED, speeds[0], 3.0 * speeds[-1], speeds[0], "m/s", logarithmic=True
+            )
+            # a law with shapes of its own is found with any slip speed
+            trials = speeds if shapes == ((),) else speeds[1:2]
+            shapes = tuple((*shape, speed) for shape in shapes for speed in trials)
+            free = (*free, slip)
+        shares = THRESHOLD_SHARES if effect.is_threshold else (0.0,)
+        probes = tuple(share * amplitude.scale for share in shares)
+        return cls(name, free, amplitude, vanishing, shapes, effect, channel, probes=probes)
+
+    def add_to(
+        self, parameters: ParameterSet, shape: Sequence[float], amplitude: float | None = None
+    ) -> ParameterSet:
+        """Add the candidate, free, to a parameter set; by default its amplitude vanishes."""
+        shape_keys = [free.key for free in self.free if free is not self.amplitude]
+        values = {**self.constants, **dict(zip(shape_keys, shape, strict=True))}
+        values[self.amplitude.key] = self.vanishing if amplitude is None else amplitude
+        if self.effect is not None:
+            parameters = parameters.with_effect(self.effect)
+        return parameters.with_values(values).with_free((*parameters.free, *self.free))
+
+    def remove_from(self, parameters: ParameterSet) -> ParameterSet:
+        """Return a parameter set without the parameters of the candidate."""
+        reduced = parameters.without(self.free)
+        values = {key: v for key, v in reduced.values.items() if key not in self.constants}
+        return replace(reduced, values=values)
+
+
+def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Candidate, ...]:
+    """Return the generic terms as candidates."""
+    candidates, scale = [], log_residuals[0].scale
+    has_contact = any((residuals.contact_state > 0).any() for residuals in log_residuals)
+    for name, ladder in list_terms(has_contact):
+        free = list_term_parameters(name, ladder, scale)
+        shapes = tuple((width,) for width in ladder) or ((),)
+        candidates.append(Candidate(f"{GENERIC_PREFIX}.{name}", free, free[0], 0.0, shapes))
+    return tuple(candidates)
+
+
+def list_candidates(
+    log_residuals: Sequence[LogResiduals], fitted: ParameterSet, without: Sequence[str] = ()
+) -> tuple[tuple[Candidate, ...], dict[str, str]]:
+    """Return (candidates not yet in the parameter set, reason for each excluded effect)."""
+    has_contact = any((residuals.contact_state != 0).any() for residuals in log_residuals)
+    channels = set.intersection(*(set(residuals.signals.channels) for residuals in log_residuals))
+    candidates, excluded = [], {}
+    for effect in (*EFFECTS, *load_plugins()):
+        reason = _exclusion_reason(effect, has_contact, channels)
+        if effect.id in without:
+            reason = "left out of the library"
+        if reason:
+            excluded[effect.id] = reason
+            continue
+        for channel in sorted(_checkable_channels(channels)) if effect.acts == "sensor" else ("",):
+            candidate = Candidate.from_effect(effect, channel, log_residuals[0].scale)
+            already_free = {free.key for free in candidate.free} & fitted.values.keys()
+            if (
+                not already_free
+                and not _is_unobservable(candidate, channels)
+                and not _is_unloaded(candidate, log_residuals)
+            ):
+                candidates.append(candidate)
+    return tuple(candidates), excluded
+
+
+def _exclusion_reason(effect: Effect, has_contact: bool, channels: set[str]) -> str:
+    if effect.is_in_bumpers and not has_contact:
+        return "there was no contact with a bumper"
+    missing = [name for name in effect.required_channels if name not in channels]
+    if missing:
+        return f"needs {', '.join(missing)}"
+    if effect.id == "mass_error":
+        cells = channels & {*RIGHT_CELLS, *LEFT_CELLS}
+        if "damper_force_n" in channels or not (cells and has_contact):
+            return "needs measured bumper forces in addition to the acceleration of the mass"
+    return ""
+
+
+def _checkable_channels(channels: set[str]) -> set[str]:
+    """Return the channels whose sensor can be checked: all except the displacement reference."""
+    has_both = {"mass_disp_m", "table_disp_m"} <= channels
+    return channels - ({"rel_disp_m"} if has_both else {"mass_disp_m", "table_disp_m"})
+
+
+def _is_unobservable(candidate: Candidate, channels: set[str]) -> bool:
+    """Return True for a sensor gain that no other measurement can contradict."""
+    gain = candidate.name.startswith("sensor_gain.")
+    if "damper_force_n" in channels and candidate.channel == "damper_force_n":
+        return gain
+    no_mass_acc = "mass_acc_m_s2" not in channels
+    return no_mass_acc and gain and candidate.channel in ("table_acc_m_s2", "rel_disp_m")
+
+
+def _is_unloaded(candidate: Candidate, log_residuals: Sequence[LogResiduals]) -> bool:
+    """Return True for gain or lag of a load cell without contact: it would only scale noise."""
+    sensor_sides = [
+        side for side, cells in enumerate((RIGHT_CELLS, LEFT_CELLS)) if candidate.channel in cells
+    ]
+    is_offset = candidate.name.startswith("sensor_offset.")
+    return not is_offset and any(
+        not any((residuals.contact_state[side] > 0).any() for residuals in log_residuals)
+        for side in sensor_sides
+    )
+
+
+def _list_shapes(
+    effect: Effect, free: Sequence[FreeParameter], scale: RecordScale
+) -> tuple[tuple[float, ...], ...]:
+    """Return trial shapes: a ladder for a single parameter, every other rung of each for more.
+
+    A resonance is found by its frequency alone: the others have the middle of their ladder.
+    """
+    shapes = [
+        (parameter.unit, _shape_ladder(parameter, own, effect, scale))
+        for parameter, own in zip(effect.parameters, free, strict=True)
+        if own.logarithmic
+    ]
+    if len(shapes) > 1:
+        is_resonance = any(unit == "Hz" for unit, _ in shapes)
+        middle = LADDER_LENGTH // 2
+        rest = slice(middle, middle + 1) if is_resonance else slice(None, None, 2)
+        shapes = [(unit, rungs if unit == "Hz" else rungs[rest]) for unit, rungs in shapes]
+    return tuple(product(*(rungs for _, rungs in shapes)))
+
+
+def _shape_ladder(
+    parameter: EffectParameter, free: FreeParameter, effect: Effect, scale: RecordScale
+) -> list[float]:
+    """Return the trial values of a shape parameter, within its bounds, SI."""
+    if parameter.unit == "Hz":
+        main_hz = 1.0 / (2 * np.pi * scale.time_s)
+        low, high = main_hz / MAX_LADDER_PERIODS, MAX_RESONANCE_SHARE / scale.sample_s
+        count = 1 + math.ceil(math.log(max(high / low, 1.0)) / math.log(RESONANCE_RATIO))
+        return [float(rung) for rung in np.geomspace(low, high, count)]
+    if parameter.unit in ("m", "m/s"):
+        largest = scale.u if parameter.unit == "m" else scale.v
+        low, high = (share * largest for share in LADDER_SHARES)
+    elif parameter.unit == "s":
+        longest = MAX_LADDER_PERIODS * 2 * np.pi * scale.time_s
+        low, high = 0.5 * scale.sample_s, min(0.1 * scale.duration_s, longest)
+    else:
+        size = measure_size(parameter, effect, "", scale) or parameter.typical
+        low, high = 0.1 * size, 10.0 * size
+    low, high = max(low, free.low), min(high, free.high)
+    rungs = np.geomspace(low, max(high, low), LADDER_LENGTH)
+    return [min(max(float(rung), free.low), free.high) for rung in rungs]

@@ -1,0 +1,270 @@
+"""The next test that would decide between what recordings leave open: variants that a rig can play.
+
+They vary what an operator can: frequencies, level, direction, dwell, waveform, and by hand the gap.
+A test beyond the limits of the rig is left out by the same check as before a run.
+"""
+
+import math
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Block
+from table_io.config.base import parse_toml
+from table_io.config.excitation import MIN_BLEND_CYCLES
+from table_io.config.profile import Profile
+from table_io.config.toml_text import format_toml
+from table_io.errors import InputError
+from table_io.records import RunStart
+from table_io.safety.preflight import CORRECTION_HEADROOM, check_limits
+from table_io.units import GRAVITY_M_S2
+from twin.discovery.discover import Discovery
+from twin.discovery.experiment_design import (
+    IdealTableMotion,
+    TestPrediction,
+    list_rivals,
+    rank_tests,
+)
+from twin.discovery.selection import FittedSet
+from twin.setup.run_config import RunConfig, from_texts
+
+Table = dict[str, Any]
+TEST_S = 75.0  # intended duration: a recording that discovery judges in seconds
+LEVEL_RATIOS = (1.0, 0.5, 2.0, 4.0)  # to the level of the recorded test
+BAND_RATIO = 2.0  # by which the band is extended to either side
+GRID_INTERVALS = 5  # between the frequencies of a sweep
+MIN_CYCLES, MAX_CYCLES = 4, 60  # held at each frequency
+DWELL_SCHEDULE_DB = (-12.0, -6.0, 0.0)  # levels of a dwell, which grows
+GAP_RATIOS = (math.inf, 0.5, 2.0)  # to the gap of the recorded test; inf: without bumpers
+SIGNIFICANT_DIGITS = 3  # significant, of frequencies and levels
+MAX_DRAWS = 1000  # of a random test
+MIN_PROBABILITY = 0.05  # of a decision, below which a test is not worth its time
+# Tables of a recorded test that are about that run alone.
+OWN_TABLES = ("sweep", "excitation", "dwell", "track", "refine", "resume", "set_up", "tracking")
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateTest:
+    """Test that the rig can play, and the change of the set-up that it asks of the operator."""
+
+    config: RunConfig
+    set_up: str = ""
+
+    @property
+    def title(self) -> str:
+        """Title of its profile: what is played."""
+        return self.config.profile.title
+
+    @property
+    def minutes(self) -> float:
+        """Expected duration in min."""
+        return self.config.expected_s / 60.0
+
+    @cached_property
+    def motion(self) -> IdealTableMotion:
+        """Motion of an ideal table."""
+        config, drive = self.config, self.config.ideal_drive
+        rest = round(config.profile.acquisition.rest_s * drive.rate_hz)
+        count = drive.planned_end + rest
+        values = np.array([drive.command(0, count), drive.acceleration(0, count)])
+        channels = ("table_disp_m", "table_acc_m_s2")
+        block = Block("meas", 0, drive.rate_hz, channels, values, *drive.labels(0, count))
+        specimen = config.profile.specimen
+        # the specimen may differ from every rival
+        allowed_peaks = {
+            sensor.channel: sensor.range_si / CORRECTION_HEADROOM for sensor in config.rig.sensors
+        }
+        return IdealTableMotion(
+            self.title, block, specimen.mass_kg, specimen.gaps_m, self.minutes, allowed_peaks
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TestProposal:
+    """Candidate test with its expected outcome, its rank, and how many were compared."""
+
+    __test__ = False  # no test of pytest
+
+    test: CandidateTest
+    prediction: TestPrediction
+    rank: int
+    count: int
+
+    @property
+    def purpose(self) -> str:
+        """What the test is for, as a clause."""
+        names = [rival.name for rival in self.prediction.rivals]
+        if self.prediction.is_confirmation:
+            return f"confirms {names[0]}: shows further effects that the recordings may hide"
+        return f"decides between {' and '.join(names)}"
+
+    def format_profile(self, rig: str, extra: Mapping[str, Table] | None = None) -> str:
+        """Return the text of its profile, which states what it is for and what is expected."""
+        content = tomllib.loads(self.test.config.profile_toml)
+        expected = (
+            f"Proposed by `shaketwin discover --decide`, which compared {self.count} tests. "
+            f"Expected in {self.test.minutes:.2g} min: {self.prediction.sigma:.2g} standard "
+            f"errors, a decision with probability {self.prediction.probability:.2f}."
+        )
+        title = f"{self.test.title}: {self.purpose}"
+        head = {"title": title, "notes": expected, "rig": rig}
+        return format_toml(
+            head | {k: v for k, v in content.items() if k not in head} | dict(extra or {})
+        )
+
+
+def propose_tests(
+    discovery: Discovery,
+    tests: Sequence[CandidateTest],
+    report: Callable[[str], None] = lambda title: None,
+    law: FittedSet | None = None,
+) -> list[TestProposal]:
+    """Return the tests that separate what a discovery leaves open, the best first.
+
+    `law` is the set with a law that was proposed for what the library does not explain.
+    """
+    problem = discovery.prepared.problem
+    rivals = list_rivals(problem, discovery.selection, discovery.verdict, law)
+    by_title = {test.title: test for test in tests}
+    motions = [test.motion for test in by_title.values()]
+    return [
+        TestProposal(by_title[prediction.motion.name], prediction, rank, len(motions))
+        for rank, prediction in enumerate(rank_tests(problem, rivals, motions, report), 1)
+        if max(prediction.probability, prediction.best_probability) >= MIN_PROBABILITY
+    ]
+
+
+def list_candidate_tests(
+    recorded: RunStart, rig_toml: str, max_min: float, can_change_gap: bool = False
+) -> list[CandidateTest]:
+    """Return the variants of a recorded test that a rig can play in `max_min` minutes each."""
+    profile, kept = _read_profile(recorded)
+    excitations, tests = [*list_excitations(profile)], []
+    for title, excitation in excitations:
+        tests += _build_tests(kept | {"title": title, "excitation": excitation}, recorded, rig_toml)
+    if can_change_gap and math.isfinite(profile.specimen.gap_mm) and profile.specimen.gap_mm > 0:
+        title, excitation = excitations[0]
+        for ratio in GAP_RATIOS:
+            gap_mm = _round(ratio * profile.specimen.gap_mm)
+            specimen = {"mass_kg": profile.specimen.mass_kg, "gap_mm": gap_mm}
+            gap = "no bumpers" if math.isinf(gap_mm) else f"total gap {gap_mm:g} mm"
+            own = {"title": f"{title}, {gap}", "excitation": excitation, "specimen": specimen}
+            tests += _build_tests(kept | own, recorded, rig_toml, f"set: {gap}")
+    return [test for test in tests if test.minutes <= max_min]
+
+
+def draw_random_test(
+    recorded: RunStart, rig_toml: str, minutes: float, generator: np.random.Generator
+) -> CandidateTest:
+    """Draw a stepped sine within the limits of the rig, of about this duration in min.
+
+    Ends of its band and its level are log-uniform over the range of the candidate tests.
+    """
+    profile, kept = _read_profile(recorded)
+    low_hz, high_hz, level_g = _measure_test(profile)
+    limits_hz = np.log([low_hz / BAND_RATIO, high_hz * BAND_RATIO])
+    limits_g = np.log([level_g * min(LEVEL_RATIOS), level_g * max(LEVEL_RATIOS)])
+    for _ in range(MAX_DRAWS):
+        ends_hz = np.sort(np.exp(generator.uniform(limits_hz[0], limits_hz[1], size=2)))
+        level = float(np.exp(generator.uniform(limits_g[0], limits_g[1])))
+        sweep = _make_sweep((float(ends_hz[0]), float(ends_hz[1])), level, duration_s=60 * minutes)
+        content = kept | {"title": "random test", "excitation": sweep}
+        if tests := _build_tests(content, recorded, rig_toml):
+            return tests[0]
+    raise InputError("the rig can play no random test", where=f"recording {recorded.run}")
+
+
+def _read_profile(recorded: RunStart) -> tuple[Profile, Table]:
+    """Return the profile of a recorded test, and of its tables those that any test keeps."""
+    profile = parse_toml(recorded.profile_toml, Profile, f"recording {recorded.run}")
+    tables = tomllib.loads(recorded.profile_toml)
+    return profile, {key: value for key, value in tables.items() if key not in OWN_TABLES}
+
+
+def _build_tests(
+    content: Mapping[str, Any], recorded: RunStart, rig_toml: str, set_up: str = ""
+) -> list[CandidateTest]:
+    """Return the test of a profile as a list; empty if it is invalid or the rig cannot play it."""
+    if content["excitation"]["kind"] != "stepped_sine":
+        content = {key: value for key, value in content.items() if key != "control"}
+    name = "decide"
+    try:
+        config = from_texts(name, format_toml(dict(content)), rig_toml, recorded.model_toml, name)
+        check_limits(config.margins, config.profile, config.rig, name)
+    except InputError:
+        return []
+    return [CandidateTest(config, set_up)]
+
+
+def list_excitations(profile: Profile) -> Iterator[tuple[str, Table]]:
+    """Yield (title, table [excitation]) of the variants of a test; the first is much as it was."""
+    low_hz, high_hz, level_g = _measure_test(profile)
+    bands = {
+        "the same band": (low_hz, high_hz),
+        "a wider band": (low_hz / BAND_RATIO, high_hz * BAND_RATIO),
+        "higher frequencies": (high_hz, high_hz * BAND_RATIO),
+        "lower frequencies": (low_hz / BAND_RATIO, low_hz),
+    }
+    if low_hz < high_hz:
+        bands["the upper half of the band"] = (math.sqrt(low_hz * high_hz), high_hz)
+    for text, band in bands.items():
+        for ratio in LEVEL_RATIOS:
+            level = _round(ratio * level_g)
+            yield f"sweep, {text}, {level:g} g", _make_sweep(band, level)
+        if text in ("the same band", "a wider band"):
+            backward = _make_sweep(band, _round(level_g), directions=("backward",))
+            yield f"sweep down alone, {text}, {_round(level_g):g} g", backward
+    for frequency in dict.fromkeys((low_hz, math.sqrt(low_hz * high_hz), high_hz)):
+        hz, level = _round(frequency), _round(2 * level_g)
+        sweep = _make_sweep((hz, hz), level, schedule=DWELL_SCHEDULE_DB, directions=("forward",))
+        yield f"dwell at {hz:g} Hz, growing to {level:g} g", sweep
+    for text, ratio in product(("the same band", "a wider band"), LEVEL_RATIOS[:3]):
+        start_hz, stop_hz = (_round(hz) for hz in bands[text])
+        level = _round(ratio * level_g)
+        if start_hz == stop_hz:
+            continue
+        yield (
+            f"chirp, {start_hz:g} to {stop_hz:g} Hz, {level:g} g",
+            {
+                "kind": "chirp", "start_hz": start_hz, "stop_hz": stop_hz, "duration_s": TEST_S,
+                "acceleration_g": level,
+            },
+        )  # fmt: skip
+
+
+def _measure_test(profile: Profile) -> tuple[float, float, float]:
+    """Return the band of a test in Hz and its peak level in g."""
+    plan = profile.plan
+    return plan.low_hz, plan.high_hz, plan.level_m_s2 / GRAVITY_M_S2
+
+
+def _make_sweep(
+    band_hz: tuple[float, float],
+    level_g: float,
+    directions: Sequence[str] = ("forward", "backward"),
+    schedule: Sequence[float] = (),
+    duration_s: float = TEST_S,
+) -> Table:
+    """Return a table [excitation] of a stepped sine with the cycles that fill a duration."""
+    start_hz = _round(band_hz[0])
+    step_hz = _round((band_hz[1] - band_hz[0]) / GRID_INTERVALS)
+    intervals = GRID_INTERVALS if step_hz > 0 else 0
+    grid_hz = start_hz + step_hz * np.arange(intervals + 1)
+    sweeps = len(directions) * max(len(schedule), 1)
+    # each step begins with a blend
+    cycles = duration_s / sweeps / float((1.0 / grid_hz).sum()) - MIN_BLEND_CYCLES
+    held = int(min(max(cycles, MIN_CYCLES), MAX_CYCLES))
+    return {
+        "kind": "stepped_sine", "start_hz": start_hz, "stop_hz": float(f"{grid_hz[-1]:.9g}"),
+        "step_hz": step_hz or start_hz, "cycles": held, "measured_cycles": min(3, held),
+        "acceleration_g": level_g, "directions": [*directions], "schedule_db": [*schedule],
+    }  # fmt: skip
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.{SIGNIFICANT_DIGITS}g}")

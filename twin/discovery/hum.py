@@ -1,0 +1,146 @@
+"""Mains hum: lines at the mains frequency and its harmonics, removed from the spectra of a record.
+
+A harmonic of the drive may coincide with a line of the mains for some steps. What tells the two
+apart is time: hum is there at rest and lasts for the whole record, a harmonic belongs to its steps.
+"""
+
+import itertools
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from scipy.fft import ifft, ifftshift, next_fast_len, rfft, rfftfreq
+from scipy.ndimage import binary_dilation
+
+from table_io.block import Bool2D, Float1D, Float2D
+from twin.discovery.spectra import FrequencyGrid, Spectrum
+
+MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
+MIN_REST_S = 0.5  # a shorter rest is not used
+CLEAR_REST_S = 2.0  # from here on the rest alone shows whether there is hum
+PART_COUNT = 4  # of a record without rest: hum is in every part
+SURROUNDINGS_HZ = 5.0
+MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
+LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a line over time
+SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
+FILTER_WIDTHS = 4.0  # half width of that filter, in standard deviations
+MAX_EXCESS = 3.0  # times the amplitude at rest: above it there is a harmonic of the drive
+FREQUENCY_STEP_HZ = 0.1  # at most, between the values of a transform that measures a line
+
+
+class _Line(NamedTuple):
+    """Line of hum in a record: frequency, and by channel its amplitude, and if it stands out."""
+
+    frequency_hz: float
+    amplitudes: Float1D
+    stands_out: Bool2D
+
+
+def remove_hum(
+    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, at_rest: Bool2D
+) -> dict[str, Spectrum]:
+    """Return the spectra, (frequency,) each, less the hum that stands out in any of them.
+
+    All channels are treated alike, so that a balance of their forces stays one. `at_rest` are the
+    samples before the motion, (sample,) at the original rate.
+    """
+    rate_hz = grid.rate_hz / grid.decimation
+    records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
+    rest = records[:, at_rest[:: grid.decimation]]
+    parts = [_measure_lines(part, rate_hz) for part in np.array_split(records, PART_COUNT, axis=1)]
+    has_rest = rest.shape[1] >= MIN_REST_S * rate_hz
+    lines_at_rest = _measure_lines(rest, rate_hz) if has_rest else itertools.repeat(None)
+    cleaned = dict(spectra)
+    for resting, *in_parts in zip(lines_at_rest, *parts, strict=False):
+        amplitudes = np.median([line.amplitudes for line in in_parts], axis=0)
+        is_hum = lasting = np.logical_and.reduce([line.stands_out for line in in_parts])
+        line_hz = float(np.median([line.frequency_hz for line in in_parts]))
+        if resting is not None:
+            # one that does not stand out at rest must not be weaker there than in motion
+            is_hum = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
+            if rest.shape[1] >= CLEAR_REST_S * rate_hz:
+                is_hum |= resting.stands_out
+                amplitudes = np.where(resting.stands_out, resting.amplitudes, amplitudes)
+                line_hz = line_hz if (is_hum & lasting).any() else resting.frequency_hz
+        if is_hum.any():
+            limits = np.where(is_hum, MAX_EXCESS * amplitudes, np.inf)
+            cleaned = _remove_line(cleaned, grid, line_hz, limits)
+    return cleaned
+
+
+def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:
+    """Return a record at rest, (sample,), without the hum that stands out, and the rms of it."""
+    if values.size < MIN_REST_S * rate_hz:
+        return values, 0.0
+    lines = _measure_lines(values[None], rate_hz)
+    frequencies_hz = np.array([line.frequency_hz for line in lines if line.stands_out[0]])
+    phase = 2.0 * np.pi * np.outer(np.arange(values.size) / rate_hz, frequencies_hz)
+    waves = np.hstack([np.cos(phase), np.sin(phase)])
+    hum: Float1D = waves @ np.linalg.lstsq(waves, values - values.mean())[0]
+    return values - hum, float(np.sqrt(np.mean(hum**2)))
+
+
+def _measure_lines(records: Float2D, rate_hz: float) -> list[_Line]:
+    """Return the highest line next to each harmonic of the mains, in records (channel, sample)."""
+    size = records.shape[1]
+    window = np.hanning(size)
+    padded = next_fast_len(max(size, round(1.0 / FREQUENCY_STEP_HZ * rate_hz)), real=True)
+    hz = rfftfreq(padded, 1.0 / rate_hz)
+    tared = records - records.mean(axis=1, keepdims=True)
+    spectra = [rfft(record * window, padded) for record in tared]
+    lines = []
+    for mains in MAINS_HZ:
+        for nominal in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains):
+            first, last = np.searchsorted(
+                hz, nominal + (SURROUNDINGS_HZ + 2 * rate_hz / size) * np.array([-1.0, 1.0])
+            )
+            distance = np.abs(hz[first:last] - nominal)
+            tolerance = MAINS_TOLERANCE * nominal + rate_hz / size
+            around = distance > tolerance + 2 * rate_hz / size  # beyond the main lobe
+            power = np.array([np.abs(spectrum[first:last]) ** 2 for spectrum in spectra])
+            inside = np.where(distance < tolerance, power, 0.0)
+            level = np.maximum(power[:, around].mean(axis=1), np.finfo(float).tiny)
+            ratio = inside.max(axis=1) / level
+            frequency_hz = float(hz[first + inside[ratio.argmax()].argmax()])
+            amplitudes = 2.0 * np.sqrt(inside.max(axis=1)) / window.sum()
+            lines.append(_Line(frequency_hz, amplitudes, ratio > MIN_LINE_RATIO))
+    return lines
+
+
+def _remove_line(
+    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, limits: Float1D
+) -> dict[str, Spectrum]:
+    """Return the spectra less one line of hum.
+
+    The line is followed over time. Where its amplitude exceeds the limit of a channel, (channel,),
+    or the record ends, hum is interpolated from before and after.
+    """
+    line_spacing = grid.rate_hz / grid.padded_size
+    centre, reach = round(line_hz / line_spacing), int(FILTER_WIDTHS * LINE_WIDTH_HZ / line_spacing)
+    # from the line upwards, then from below up to it: the order of a transform of the envelope
+    offset = ifftshift(np.arange(-reach, reach + 1))
+    gain = np.exp(-0.5 * (offset * line_spacing / LINE_WIDTH_HZ) ** 2)
+    scale = 2.0 * offset.size / grid.padded_size
+    envelopes = scale * ifft([x[centre + offset] * gain for x in spectra.values()], axis=1)
+    step_s = 1.0 / (offset.size * line_spacing)
+    time_s = np.arange(offset.size) * step_s
+    is_loud = (np.abs(envelopes) > limits[:, None]).any(axis=0)
+    spread = math.ceil(FILTER_WIDTHS * SETTLING_S / step_s)
+    known = ~binary_dilation(is_loud, iterations=spread) if is_loud.any() else ~is_loud
+    end_s = 2.0 * SETTLING_S
+    known &= (time_s > end_s) & (time_s < grid.size / grid.rate_hz - end_s)
+    if known.sum() < 2:
+        return dict(spectra)
+    # the envelope turns slowly: its frequency is between two lines of the spectrum
+    pairs = known[1:] & known[:-1]
+    turn = np.sum((envelopes[:, 1:] * envelopes[:, :-1].conj())[:, pairs])
+    exact_hz = centre * line_spacing + float(np.angle(turn)) / (2 * np.pi * step_s)
+    turning = np.exp(-2j * np.pi * (exact_hz - centre * line_spacing) * time_s)
+    sample_s = np.arange(-(-grid.size // grid.decimation)) * grid.decimation / grid.rate_hz
+    carrier = np.exp(2j * np.pi * exact_hz * sample_s)
+    cleaned = {}
+    for (name, spectrum), envelope in zip(spectra.items(), envelopes * turning, strict=True):
+        hum = np.interp(sample_s, time_s[known], envelope[known]) * carrier
+        cleaned[name] = spectrum - grid.from_time_domain(hum.real)
+    return cleaned

@@ -1,0 +1,354 @@
+"""Nuisance parameters: the small errors of instruments and set-up that every laboratory has.
+
+A nuisance z is in units of its typical size (its prior is a standard normal distribution) and
+enters the residual of a log linearly: r + sum of z x column. What it explains is no evidence for an
+effect of the specimen. Kinds, by channel or side:
+
+    gain, lag            of a channel: reading = (1 + gain) x value(t - lag)
+    low_cut              of an accelerometer: corner of its high pass of the first order
+    resonance            of an accelerometer on its bracket: the inverse square of its frequency
+    offset               of a channel, after its tare; constant, and slow with time (offset1, ...)
+    chebyshev2 to 7      of a laser, in position: terms of its linearity error, 0 at position 0
+    share, share_slope   of the force of a side between its two cells: constant, and with position
+    plate                mass in front of the cells of a side, which the table accelerates
+    cross                part of the acceleration of the table in the accelerometer of the mass
+    gap                  reading of the set-up: right gap against left gap
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+from numpy.polynomial import Chebyshev
+
+from table_io.block import Bool2D, Float1D
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.discovery.least_squares import FitResult, MapFunction
+from twin.discovery.parameters import (
+    BUMPER_DAMPING,
+    BUMPER_STIFFNESS,
+    FreeParameter,
+    GapKey,
+    ParameterSet,
+    is_correction,
+    size_of_unit,
+)
+from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
+from twin.discovery.signals import SENSOR_PAIRS, LogSignals
+from twin.discovery.spectra import Spectrum
+
+ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
+LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
+SIDES = {"right": RIGHT_CELLS, "left": LEFT_CELLS}
+LINEARITY_DEGREES = range(2, 8)
+SLOW_TERMS = 2  # cosines over the length of the record, besides the constant offset
+# Typical sizes (one standard deviation).
+TYPICAL_GAIN = 0.005  # calibration and temperature
+TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
+TYPICAL_LOW_CUT = 2.0 * math.pi * 0.25  # rad/s, of an IEPE accelerometer: 5 % at 0.8 Hz
+RESTORED_FROM_HZ = 0.1  # what a low cut took away
+TYPICAL_RESONANCE = (2.0 * math.pi * 400.0) ** -2.0  # s2/rad2, of a bracket of sheet metal
+TYPICAL_OFFSET = 0.005  # of the rms of the channel: drift since the tare
+TYPICAL_LASER_OFFSET = 0.001
+TYPICAL_LINEARITY = 0.002  # of the largest excursion, each term of the error of a laser
+# Of the largest excursion: speckle and roughness under the light spot of a laser, which the rest
+# does not show, and at low frequency no accelerometer.
+TYPICAL_SURFACE = 1e-4
+TYPICAL_CORNER_HZ = 1.0  # below it 1/f noise exceeds white noise, which is seen at WHITE_CYCLES
+WHITE_CYCLES = 0.05  # per sample
+TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest excursion
+TYPICAL_PLATE = 0.005  # of the specimen's mass
+TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
+TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
+# Share of the change of a parameter due to the nuisances that their assumed forms leave open.
+OPEN_SHARE = 0.005
+GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
+MAX_SIZE = 4.0  # typical sizes; a larger error is a fault, and an effect of its own
+# Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
+TYPICAL_LIMITS: Mapping[str, float] = {
+    "sensor_gain": MAX_SIZE * TYPICAL_GAIN,
+    "sensor_lag": MAX_SIZE * TYPICAL_LAG_S,
+    "mass_error": MAX_SIZE * TYPICAL_MASS,
+    "gap_offset": MAX_SIZE * TYPICAL_GAP_M,
+}
+SLOPE_STEP = 0.1  # of a typical size, for the finite difference
+MIN_COLUMN_NORM = 1.0  # a nuisance that changes the residual by less at its typical size is dropped
+
+
+def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
+    """Return the nuisances that the channels of a log can have."""
+    channels = signals.channels
+    # No measurement contradicts the scale of all displacements together, nor their common lag; that
+    # of all forces is the mass, or a force sensor of the damper.
+    references = ("rel_disp_m", "mass_disp_m", "damper_force_n")
+    # Alone, an accelerometer that lags looks like damping: another sensor must see the same motion.
+    paired_sensors = {
+        channel for pair in SENSOR_PAIRS.values() if {*pair} <= {*channels} for channel in pair
+    }
+    checkable = [
+        channel
+        for channel in channels
+        if channel not in references
+        and (channel not in ACCELEROMETERS or channel in paired_sensors)
+    ]
+    pairs = {side: cells for side, cells in SIDES.items() if {*cells} <= {*channels}}
+    paired = {cell for cells in pairs.values() for cell in cells}
+    # The gains of two cells are that of their sum, and their shares.
+    scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
+    nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
+    nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
+    nuisances += [
+        Nuisance(kind, channel, size)
+        for kind, size in (("low_cut", TYPICAL_LOW_CUT), ("resonance", TYPICAL_RESONANCE))
+        for channel in checkable
+        if channel in ACCELEROMETERS
+    ]
+    for channel in channels:
+        share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
+        size = share * signals.channel_rms(channel)
+        nuisances += [
+            Nuisance("offset" + (str(term) if term else ""), channel, size)
+            for term in range(SLOW_TERMS + 1)
+        ]
+    for channel in channels:
+        if channel in LASERS:
+            nuisances += [
+                Nuisance(f"chebyshev{degree}", channel, TYPICAL_LINEARITY)
+                for degree in LINEARITY_DEGREES
+            ]
+    for side in pairs:
+        nuisances += [
+            Nuisance("share", side, TYPICAL_SHARE),
+            Nuisance("share_slope", side, TYPICAL_SHARE_SLOPE),
+        ]
+        if "table_acc_m_s2" in channels:
+            nuisances.append(Nuisance("plate", side, TYPICAL_PLATE * signals.mass_kg))
+    if {"mass_acc_m_s2", "table_acc_m_s2"} <= {*channels}:
+        nuisances.append(Nuisance("cross", "mass_acc_m_s2", TYPICAL_CROSS))
+    if any(math.isfinite(gap) for gap in signals.gaps_m):
+        nuisances.append(Nuisance("gap", "", TYPICAL_GAP_M))
+    return tuple(nuisances)
+
+
+def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSignals:
+    """Return the signals corrected for a nuisance of z typical sizes."""
+    amount, place = z * nuisance.size, nuisance.place
+    match nuisance.kind:
+        case "gap":
+            right, left = signals.gaps_m
+            return replace(signals, gaps_m=(right + amount, left - amount))
+        case _ if place in SIDES:
+            return _with_spectra(signals, _correct_cells(signals, nuisance.kind, place, amount))
+    spectrum = signals.spectra[place]
+    match nuisance.kind:
+        case "gain":
+            corrected = spectrum / (1.0 + amount)
+        case "lag":
+            corrected = spectrum * np.exp(1j * signals.omega * amount)
+        case "low_cut":
+            # not where the mass hardly accelerates: slow noise would grow without limit there
+            omega = np.maximum(signals.omega, signals.omega[1])
+            is_fast = 1.0 / (1.0 + (2.0 * np.pi * RESTORED_FROM_HZ / omega) ** 8)
+            corrected = spectrum * (1.0 - 1j * is_fast * amount / omega)
+        case "resonance":
+            corrected = spectrum * (1.0 - amount * signals.omega**2)
+        case "cross":
+            corrected = spectrum - amount * signals.spectra["table_acc_m_s2"]
+        case kind if kind.startswith("chebyshev"):
+            x = signals.grid.to_time_domain(spectrum)
+            largest = float(np.abs(x).max()) or 1.0
+            shape = Chebyshev.basis(int(kind.removeprefix("chebyshev")))
+            error = amount * largest * (shape(x / largest) - shape(0.0))
+            corrected = spectrum - signals.grid.from_time_domain(error)
+        case _:  # offset, offset1, ...
+            term = int(nuisance.kind.removeprefix("offset") or 0)
+            phase = np.pi * term * np.arange(signals.time_s.size) / signals.time_s.size
+            corrected = spectrum - signals.grid.from_time_domain(amount * np.cos(phase))
+    return _with_spectra(signals, {place: corrected})
+
+
+def _correct_cells(signals: LogSignals, kind: str, side: str, amount: float) -> dict[str, Spectrum]:
+    """Return the spectra of the two cells of a side, corrected."""
+    cells = SIDES[side]
+    first, second = (signals.spectra[cell] for cell in cells)
+    if kind == "gain":
+        return {cell: signals.spectra[cell] / (1.0 + amount) for cell in cells}
+    if kind == "plate":
+        inertia = 0.5 * amount * signals.spectra["table_acc_m_s2"]
+        return dict(zip(cells, (first + inertia, second + inertia), strict=True))
+    moved = amount * (first + second)
+    if kind == "share_slope":
+        u = signals.grid.to_time_domain(signals.relative_spectrum)
+        moved = signals.grid.from_time_domain(
+            u / float(np.abs(u).max() or 1.0) * signals.grid.to_time_domain(moved)
+        )
+    return dict(zip(cells, (first - moved, second + moved), strict=True))
+
+
+def _with_spectra(signals: LogSignals, spectra: Mapping[str, Spectrum]) -> LogSignals:
+    return replace(signals, spectra={**signals.spectra, **spectra})
+
+
+def linearize_nuisances(
+    residuals: LogResiduals,
+    parameters: ParameterSet,
+    calibrate: bool = False,
+    mapper: MapFunction = map,
+) -> LogResiduals:
+    """Return the residuals of a log with its nuisances as linear terms.
+
+    The signals are corrected for the nuisances in `parameters`, about which the terms are linear.
+    With `calibrate` the noise of the corrected sensors is taken from their disagreement.
+    """
+    terms = residuals.nuisances
+    raw = _add_typical_noise(residuals.signals) if terms is None else terms.raw
+    signals = replace(raw)  # a copy, so that the series of its fusion are not kept with the terms
+    nuisances = list_nuisances(raw)
+    centre = dict.fromkeys(nuisances, 0.0)
+    if terms is not None:
+        centre |= dict(zip(terms.nuisances, terms.centre + terms.values(parameters), strict=True))
+    for nuisance, z in centre.items():
+        signals = correct_signals(signals, nuisance, z) if z else signals
+    if calibrate:
+        signals = signals.calibrate_noise()
+    bare = replace(
+        residuals, signals=signals, nuisances=None, motion_cache=[],
+        known_contact=residuals.contact_state,
+    )  # fmt: skip
+    before = bare.evaluate_rows(parameters, bare.motion())
+    noise_shares = _compute_noise_shares(bare, parameters, before, mapper)
+
+    def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
+        corrected = correct_signals(signals, nuisance, SLOPE_STEP)
+        rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
+        # A gain or a resonance scales the noise too, so that a large one would seem to reduce the
+        # misfit: the share of the noise in the slope is taken out.
+        slope: Float1D = (rows - before) / SLOPE_STEP
+        if nuisance.kind in ("gain", "resonance"):
+            scaled = SIDES.get(nuisance.place, (nuisance.place,))
+            shares = sum(noise_shares[nuisance.kind, channel] for channel in scaled)
+            slope += nuisance.size * shares * before
+        return slope.astype(np.float32)
+
+    kept = [
+        (nuisance, column)
+        for nuisance, column in zip(nuisances, mapper(slope, nuisances), strict=True)
+        if column @ column > MIN_COLUMN_NORM**2 or centre[nuisance]
+    ]
+    table = np.array([column for _, column in kept], dtype=np.float32).reshape(-1, before.size)
+    terms = NuisanceTerms(
+        raw, residuals.log_number, tuple(nuisance for nuisance, _ in kept), table,
+        np.array([centre[nuisance] for nuisance, _ in kept]),
+    )  # fmt: skip
+    return replace(bare, nuisances=terms)
+
+
+def _add_typical_noise(signals: LogSignals) -> LogSignals:
+    """Return the signals with the noise that a short rest does not show: 1/f, and of surfaces."""
+    u = signals.grid.to_time_domain(signals.relative_spectrum)
+    hz = signals.omega / (2.0 * np.pi)
+    slow = np.sqrt(1.0 + TYPICAL_CORNER_HZ / np.maximum(hz, 0.5 * hz[1]))
+    middle = WHITE_CYCLES * signals.grid.rate_hz
+    noise = {
+        channel: np.maximum(density, np.interp(middle, hz, density) * slow)
+        for channel, density in signals.noise.items()
+    }
+    return replace(signals, noise=noise, surface_noise_m=TYPICAL_SURFACE * float(np.abs(u).max()))
+
+
+def _compute_noise_shares(
+    residuals: LogResiduals, parameters: ParameterSet, before: Float1D, mapper: MapFunction
+) -> dict[tuple[str, str], Float1D]:
+    """Return how gains and resonances scale the noise of the row of each entry, (entry,).
+
+    By kind and channel: the share of its noise in that of the row, for a resonance weighted with
+    the square of the angular frequency.
+    """
+    signals = residuals.signals
+    phase = np.exp(1j * np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE))  # as if random
+    rows = residuals.entry_row[: before.size]
+    counts = np.maximum(np.bincount(rows), 1)
+
+    def evaluate_noise(channel: str, gain: Float1D) -> Float1D:
+        density = gain * signals.noise[channel] * math.sqrt(signals.grid.size)
+        noisy = _with_spectra(signals, {channel: signals.spectra[channel] + density * phase})
+        return residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
+
+    def mean_products(channel: str) -> dict[str, Float1D]:
+        """Return the mean products of the noise of a channel with itself, scaled, (row,) each."""
+        noise = evaluate_noise(channel, np.ones_like(signals.omega))
+        scaled = {"gain": noise}
+        if channel in ACCELEROMETERS:
+            # never more than the noise itself, along which a force law need not be linear
+            largest = float(signals.omega[-1]) ** 2
+            scaled["resonance"] = largest * evaluate_noise(channel, signals.omega**2 / largest)
+        return {
+            kind: np.bincount(rows, weights=noise * values) / counts
+            for kind, values in scaled.items()
+        }
+
+    products = dict(zip(signals.channels, mapper(mean_products, signals.channels), strict=True))
+    total = np.maximum(np.sum([of["gain"] for of in products.values()], axis=0), 1e-300)
+    return {
+        (kind, channel): (product / total)[rows]
+        for channel, of_channel in products.items()
+        for kind, product in of_channel.items()
+    }
+
+
+def sensor_mask(residuals: LogResiduals) -> Bool2D:
+    """Return the entries that compare sensors with each other, or with their tare, (entry,)."""
+    rows = [
+        number
+        for number, name in enumerate((*residuals.rows, "rest"))
+        if name in SENSOR_PAIRS or name == "rest"
+    ]
+    mask: Bool2D = np.isin(residuals.entry_row, rows)
+    return mask
+
+
+def list_nuisance_parameters(log_residuals: Sequence[LogResiduals]) -> tuple[FreeParameter, ...]:
+    """Return the free parameters of the nuisances of all logs."""
+    return tuple(
+        FreeParameter(key, -MAX_SIZE - centre, MAX_SIZE - centre, 1.0, "")
+        for residuals in log_residuals
+        if residuals.nuisances is not None
+        for key, centre in zip(residuals.nuisances.keys, residuals.nuisances.centre, strict=True)
+    )
+
+
+def widen_intervals(
+    fit: FitResult, ideal: FitResult, log_residuals: Sequence[LogResiduals]
+) -> FitResult:
+    """Return a fit with nuisances whose standard deviations hold what these leave open.
+
+    No sensor contradicts the scale of all displacements: a parameter is as uncertain as it depends
+    on it, which its unit tells, as forces are masses times accelerations. A bumper meets a part of
+    the range of the lasers, with its own slope within their linearity. And the change since the
+    fit `ideal`, without nuisances, depends on their assumed forms.
+    """
+    std_errors = dict(fit.std_errors)
+    for free in fit.free:
+        key = free.key
+        if is_correction(key):
+            continue
+        value = fit.values[key]
+        size = abs(value)
+        if isinstance(key, GapKey):
+            size += max(filter(math.isfinite, log_residuals[key.log].signals.gaps_m), default=0.0)
+        is_bumper = key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
+        std_errors[key] = math.hypot(
+            std_errors[key],
+            TYPICAL_GAIN * _length_exponent(free.unit) * size,
+            TYPICAL_LINEARITY * size if is_bumper else 0.0,
+            OPEN_SHARE * (value - ideal.values[key]) if key in ideal.values else 0.0,
+        )
+    return replace(fit, std_errors=std_errors)
+
+
+def _length_exponent(unit: str) -> float:
+    """Return the power with which a quantity in this unit grows with the scale of lengths."""
+    ratio = size_of_unit(unit, force=math.e, length=math.e, time=1.0)
+    return math.log(ratio) if ratio else 0.0

@@ -1,0 +1,587 @@
+"""Residuals: measured minus modelled forces, evaluated on the measured motion.
+
+    damper            -M a - F_R - F_L - D; the damper force from the force balance, or measured
+    right, left       F_R - model, -(F_L - model), where contact was measured
+    mass, table       sensor-consistency residuals, see `motion`
+    right, left cells difference of the two load cells of a side
+    right, left pull  tension of a side just after release, where every bumper law gives zero force
+    rest              reading of each channel before the motion starts, and of u; one entry each
+Each row is divided by its noise. Without load cells the damper row holds all forces, and contact
+comes from the model. Nothing is simulated (inverse dynamics), so a fit converges from distant start
+values and in chaotic motion.
+
+Residuals of real rigs are autocorrelated (colored): statistics use blocks, never single samples.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import binary_opening
+
+from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from twin.discovery.generic_terms import compute_generic_forces, compute_resonator_force
+from twin.discovery.motion import (
+    ConsistencyResidual,
+    MeasuredMotion,
+    RecordScale,
+    measure_scale,
+)
+from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet, TermKey
+from twin.discovery.signals import LogSignals, derives_acc
+from twin.model.inverse_dynamics import depends_on_history, forces_along
+from twin.model.model import Model, SensorModel
+
+CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
+MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
+# A shorter contact is the ringing of a filter before or after a step of the force.
+MIN_CONTACT_SAMPLES, MIN_CONTACT_FILTER_CYCLES = 3, 0.5
+CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
+# The same after an anti-alias filter: periods of its corner until its response to a step has died.
+FILTER_SETTLING_CYCLES = 3.0
+BLOCK_S = 1.0  # block length where there are no forcing cycles
+FORCE_ROWS = ("damper", "right", "left")
+CONTACT_ROWS = ("right", "left")
+TARED_CHANNELS = ("acc", "right", "left")
+PULL_ROWS = ("right pull", "left pull")
+# of the largest contact force: undershoot of the low pass after a release
+MAX_UNDERSHOOT_SHARE = 0.005
+MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
+MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
+MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
+
+
+@dataclass(frozen=True, slots=True)
+class Nuisance:
+    """Nuisance of a log: kind and place (channel or side), and typical size in its own unit."""
+
+    kind: str
+    place: str
+    size: float
+
+
+@dataclass(frozen=True, eq=False)
+class NuisanceTerms:
+    """Linear terms of a log: `columns`, (nuisance, entry) without the rest row, per typical size.
+
+    `centre` are the values, (nuisance,), for which the `raw` signals have been corrected already.
+    """
+
+    raw: LogSignals
+    log_number: int
+    nuisances: tuple[Nuisance, ...]
+    columns: npt.NDArray[np.float32]
+    centre: Float1D
+
+    @cached_property
+    def keys(self) -> tuple[NuisanceKey, ...]:
+        """Keys of the nuisances in a parameter set."""
+        return tuple(NuisanceKey(self.log_number, n.kind, n.place) for n in self.nuisances)
+
+    def values(self, parameters: ParameterSet) -> Float1D:
+        """Return the values of the nuisances in a parameter set, (nuisance,)."""
+        return np.array([parameters.values.get(key, 0.0) for key in self.keys])
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMotion:
+    """Motion at the samples where forces are needed, and whole: some depend on its history.
+
+    `contact` (2, sample) is the contact state at these samples, and `consistency` are the
+    consistency residuals, each at the samples of its own row.
+    """
+
+    whole: MeasuredMotion
+    samples: Int1D | slice
+    m: MeasuredMotion
+    contact: npt.NDArray[np.int8]
+    consistency: tuple[ConsistencyResidual, ...] = ()
+
+    @cached_property
+    def largest_pushes(self) -> tuple[float, float]:
+        """Largest measured force of the right and of the left side of the whole motion in N."""
+        return float(np.nanmax(self.whole.right)), float(np.nanmax(self.whole.left))
+
+
+@dataclass(frozen=True, eq=False)
+class LogResiduals:
+    """Regression problem of one log: residual rows, sample selection, blocks and noise.
+
+    `log_number` is the index of the log; `reference` supplies the stiffness and damping that
+    convert noise of the motion into noise of the forces. `contact_n` is a least contact threshold
+    in N, which may be 0: see `contact_thresholds_n`.
+    """
+
+    log_number: int
+    signals: LogSignals
+    contact_n: float
+    reference: Model
+    scale: RecordScale
+    weight: float = 1.0  # noise multiplier; above 1 where model error, not noise, limits the fit
+    thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
+    nuisances: NuisanceTerms | None = None
+    known_contact: npt.NDArray[np.int8] | None = None  # (2, sample), else from the load cells
+    motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
+
+    def motion(self, sensors: tuple[SensorModel, ...] = ()) -> MeasuredMotion:
+        """Return the motion for assumed sensor models; the most recent ones are cached."""
+        motion = next((m for key, m in self.motion_cache if key == sensors), None)
+        if motion is None:
+            motion = self.signals.fuse_motion(sensors)
+            unmodified = [pair for pair in self.motion_cache if not pair[0]]
+            recent = [pair for pair in self.motion_cache if pair[0]][-MAX_CACHED_MOTIONS + 1 :]
+            # a single assignment, because other threads may be reading
+            self.motion_cache[:] = [*unmodified, *recent, (sensors, motion)]
+        return motion
+
+    @cached_property
+    def contact_state(self) -> npt.NDArray[np.int8]:
+        """Measured contact of right and left, (2, sample): 1 contact, 0 none, -1 unknown."""
+        if self.known_contact is not None:
+            return self.known_contact
+        m = self.motion()
+        if not m.has_load_cells:
+            known = -1 if any(math.isfinite(gap) for gap in m.gaps_m) else 0
+            return np.full((2, m.u.size), known, dtype=np.int8)
+        sides = []
+        shortest = max(
+            MIN_CONTACT_SAMPLES,
+            math.ceil(MIN_CONTACT_FILTER_CYCLES * m.rate_hz / self.signals.filter_hz) + 1,
+        )
+        for push, threshold, gap in zip(
+            (m.right, m.left), self.contact_thresholds_n, m.gaps_m, strict=True
+        ):
+            idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
+            sides.append(binary_opening(push - idle > threshold, np.ones(shortest)))
+        return np.array(sides, dtype=np.int8)
+
+    @cached_property
+    def contact_thresholds_n(self) -> tuple[float, float]:
+        """Force of the right and of the left cells in N above which there is contact."""
+        m = self.motion()
+        squares = np.nan_to_num(m.acc[m.moving] ** 2)
+        inertia_n = m.mass_kg * math.sqrt(squares.mean()) if squares.size else 0.0
+        least = max(self.contact_n, MIN_CONTACT_SHARE * inertia_n)
+        right, left = (
+            max(least, CONTACT_NOISE_FACTOR * rms) for rms in (m.noise.right, m.noise.left)
+        )
+        return right, left
+
+    @cached_property
+    def row_mask(self) -> Bool2D:
+        """Sample selection of each residual row, (row, sample)."""
+        m = self.motion()
+        used = np.zeros((len(self.rows), m.u.size), dtype=bool)
+        used[0] = m.moving & np.isfinite(self.measured_forces(m, m.mass_kg)[0])
+        margin_s = max(CONTACT_MARGIN_S, FILTER_SETTLING_CYCLES / self.signals.filter_hz)
+        margin = max(round(margin_s * m.rate_hz), 1)
+        window = np.ones(2 * margin + 1)
+        if m.has_load_cells and m.damper is None:
+            for row in range(2):
+                in_contact = self.contact_state[row] > 0
+                used[1 + row] = (
+                    m.moving & in_contact & (np.convolve(~in_contact, window, "same") == 0)
+                )
+        recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
+        contact = self.contact_state
+        if (contact < 0).any():  # without load cells, as the model expects
+            forces = forces_along(self.reference_for(m), m.u, m.v, m.table_acc, m.time_s, contact)[
+                1:
+            ]
+            contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
+        change = np.abs(np.diff(contact, axis=1, prepend=contact[:, :1])).any(axis=0)
+        smooth = np.convolve(change, window, "same") == 0
+        if contact is not self.contact_state:
+            used[0] &= smooth
+        for row, name in enumerate(self.rows):
+            if name in PULL_ROWS:
+                in_contact = self.contact_state[PULL_ROWS.index(name)] > 0
+                was_in_contact = np.convolve(in_contact, recent, "same") > 0
+                # a filter of linear phase rings before the step of the force at touch, too
+                will_be_in_contact = np.convolve(in_contact, recent[::-1], "same") > 0
+                used[row] = m.moving & ~in_contact & was_in_contact & ~will_be_in_contact
+            elif row >= len(FORCE_ROWS):
+                side = {"right cells": 0, "left cells": 1}.get(name)
+                used[row] = m.moving & smooth if side is None else used[1 + side]
+        return used & self._thinning_mask
+
+    def reference_for(self, m: MeasuredMotion) -> Model:
+        """Return the reference model with the mass and the stated gaps of this log."""
+        right, left = m.gaps_m
+        base = replace(self.reference.base, mass=m.mass_kg, gap_r=right, gap_l=left)
+        return Model(base, self.reference.effects)
+
+    @cached_property
+    def _thinning_mask(self) -> Bool2D:
+        """Samples kept after thinning, (sample,): the last cycles of each step, every n-th block.
+
+        At least two consecutive cycles are kept: their difference gives the noise.
+        """
+        m = self.motion()
+        if self.thinning == 1:
+            return np.ones(m.u.size, dtype=bool)
+        cycle_count = np.zeros(int(m.step.max(initial=-1)) + 2, dtype=np.int64)
+        np.maximum.at(cycle_count, m.step, m.cycle + 1)  # step -1 is the last entry
+        is_counted = m.cycle >= (cycle_count - np.maximum(cycle_count // self.thinning, 2))[m.step]
+        counting: Bool2D = np.where(
+            m.cycle >= 0, is_counted, self.sample_block % self.thinning == 0
+        )
+        return counting
+
+    @cached_property
+    def rest_channels(self) -> tuple[str, ...]:
+        """Channels that must read zero at rest."""
+        if min(self.signals.gaps_m) <= 0:  # precompression: forces at rest are real
+            return ()
+        return tuple(self.signals.rest_values)
+
+    @cached_property
+    def rows(self) -> tuple[str, ...]:
+        """Names of the rows that have samples; the rest row follows them."""
+        m = self.motion()
+        pulls = PULL_ROWS if m.has_load_cells and m.damper is None else ()
+        return (*FORCE_ROWS, *(consistency.body for consistency in m.consistency_residuals), *pulls)
+
+    @cached_property
+    def _row_samples(self) -> tuple[Int1D, ...]:
+        """Samples of each row."""
+        return tuple(np.flatnonzero(row) for row in self.row_mask)
+
+    @cached_property
+    def _used_samples(self) -> Int1D:
+        """Samples of any row, (used,); all samples where the rows are whitened over time."""
+        if self.whitening is not None:
+            return np.arange(self.row_mask.shape[1])
+        return np.flatnonzero(self.row_mask.any(axis=0))
+
+    @cached_property
+    def _row_places(self) -> tuple[Int1D, ...]:
+        """Places of the samples of each row among the used ones."""
+        return tuple(np.flatnonzero(row[self._used_samples]) for row in self.row_mask)
+
+    @cached_property
+    def _sampled_motions(self) -> list[SampledMotion]:
+        """Cache of `_sample_motion`: of the motions in the cache of motions, and the last one."""
+        return []
+
+    def _sample_motion(self, m: MeasuredMotion) -> SampledMotion:
+        """Return what the residual needs of a motion; the most recent ones are cached."""
+        sampled = next((known for known in self._sampled_motions if known.whole is m), None)
+        if sampled is None:
+            samples, residuals = self._used_samples, m.consistency_residuals
+            rows = self._row_samples[len(FORCE_ROWS) :][: len(residuals)]
+            consistency = tuple(
+                replace(residual, values=residual.values[row])
+                for residual, row in zip(residuals, rows, strict=True)
+            )
+            sampled = SampledMotion(
+                m, samples, m.select(samples), self.contact_state[:, samples], consistency
+            )
+            cached = [motion for _, motion in self.motion_cache]
+            kept = [s for s in self._sampled_motions if any(s.whole is motion for motion in cached)]
+            self._sampled_motions[:] = [*kept, sampled]
+        return sampled
+
+    @cached_property
+    def entry_row(self) -> Int1D:
+        """Row of each residual entry, (entry,)."""
+        rows = np.repeat(np.arange(len(self.rows)), self.row_mask.sum(axis=1))
+        return np.concatenate([rows, np.full(self._rest_entry_count, len(self.rows))])
+
+    @property
+    def _rest_entry_count(self) -> int:
+        """Number of residual entries in the rest row."""
+        priors = len(self.nuisances.keys) if self.nuisances is not None else 0
+        return len(self.rest_channels) + len(self.signals.zero_channels) + priors
+
+    @cached_property
+    def entry_sample(self) -> Int1D:
+        """Sample of each residual entry, (entry,)."""
+        at_rest = np.zeros(self._rest_entry_count, dtype=np.int64)
+        return np.concatenate([*self._row_samples, at_rest])
+
+    @cached_property
+    def entry_block(self) -> Int1D:
+        """Block of each residual entry, (entry,)."""
+        return self.sample_block[self.entry_sample]
+
+    @cached_property
+    def entry_contact_block(self) -> Int1D:
+        """Block of each entry, (entry,), without splitting a contact at a block boundary.
+
+        Slow errors of u bias C_j in one direction during compression and in the other during
+        restitution; a contact split in two would look like two strong gradients. A contact longer
+        than two blocks is split nevertheless.
+        """
+        in_flight = (self.contact_state <= 0).all(axis=0)
+        last_flight = np.maximum.accumulate(np.where(in_flight, np.arange(in_flight.size), 0))
+        start_block = self.sample_block[last_flight]
+        contact_block: Int1D = np.where(
+            self.sample_block - start_block <= 1, start_block, self.sample_block
+        )
+        return contact_block[self.entry_sample]
+
+    def measured_forces(
+        self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None = None
+    ) -> Float2D:
+        """Return (3, sample) in N: damper force from the force balance of the mass, F_R, -F_L."""
+        return np.array(self._measured_forces(m, mass_kg, parameters))
+
+    def _measured_forces(
+        self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None
+    ) -> tuple[Float1D, Float1D, Float1D]:
+        zero_error = {
+            channel: parameters.tare_error(self.log_number, channel) if parameters else 0.0
+            for channel in TARED_CHANNELS
+        }
+        if m.damper is not None:
+            nothing = np.full(m.u.size, np.nan)
+            return m.damper, nothing, nothing
+        inertia, right, left = (
+            -mass_kg * (m.acc - zero_error["acc"]), m.right - zero_error["right"],
+            m.left - zero_error["left"]
+        )  # fmt: skip
+        return (inertia - right + left if m.has_load_cells else inertia), right, left
+
+    def force_noise(self, m: MeasuredMotion, mass_kg: float) -> Float1D:
+        """Return the rms sensor noise of the force rows in N, (3,).
+
+        Use the assumed mass and sensor gains; otherwise a smaller mass would seem to fit better
+        only because it scales the noise of the accelerometer down.
+        """
+        n, p = m.noise, self.reference.parameters
+        motion = math.hypot(p.stiffness * n.u, p.damping * n.v)
+        sides = [
+            math.hypot(cells, k * n.u, c * n.v)
+            for cells, k, c in (
+                (n.right, p.bumper_stiffness_r, p.bumper_damping_r),
+                (n.left, p.bumper_stiffness_l, p.bumper_damping_l),
+            )
+        ]
+        if m.damper is not None:
+            return np.array([math.hypot(n.force, motion), np.nan, np.nan])
+        cells = (n.right, n.left) if m.has_load_cells else ()
+        if self.whitening is not None:
+            return np.array([mass_kg, *sides])
+        return np.array([math.hypot(mass_kg * n.acc, motion, *cells), *sides])
+
+    @cached_property
+    def whitening(self) -> Float1D | None:
+        """Whitening filter of the damper row, (frequency,); None with an accelerometer."""
+        if not derives_acc(self.signals.channels) or self.motion().damper is not None:
+            return None
+        p, mass = self.reference.parameters, self.signals.mass_kg
+        return self.signals.whitening(p.stiffness / mass, p.damping / mass)
+
+    @cached_property
+    def sample_block(self) -> Int1D:
+        """Block number of each sample, (sample,): a forcing cycle, or one second outside steps."""
+        m = self.motion()
+        second_number = (m.time_s / BLOCK_S).astype(np.int64)
+        second = np.where(m.cycle >= 0, 0, second_number)
+        key = np.stack([m.step, m.cycle, second])
+        change = np.any(np.diff(key, axis=1) != 0, axis=0)
+        numbers: Int1D = np.concatenate([[0], np.cumsum(change)])
+        return numbers
+
+    def evaluate(self, parameters: ParameterSet) -> Float1D:
+        """Return the residual over its noise, (entry,): measured minus model, row after row.
+
+        Finite also for a model that diverges, as one of a trial may.
+        """
+        m = self.motion(parameters.assumed_sensors())
+        rows, rest = self._list_rows(parameters, m), self._rest_entries(parameters)
+        if self.nuisances is None:
+            entries = np.concatenate([*rows, rest])
+            entries /= self.weight
+            return _bound_diverged(entries)
+        values, columns = self.nuisances.values(parameters), self.nuisances.columns
+        priors = self.nuisances.centre + values
+        entries = np.concatenate([*rows, rest, priors])
+        entries[: columns.shape[1]] += values.astype(np.float32) @ columns
+        # the priors keep their weight where model error limits the fit
+        entries[: entries.size - priors.size] /= self.weight
+        return _bound_diverged(entries)
+
+    @property
+    def gap_correction(self) -> float:
+        """Right gap of the signals minus the stated one, and stated minus left, in m."""
+        raw = self.signals if self.nuisances is None else self.nuisances.raw
+        return self.signals.gaps_m[0] - raw.gaps_m[0] if math.isfinite(raw.gaps_m[0]) else 0.0
+
+    def gap_reading_error(self, parameters: ParameterSet) -> float:
+        """Return true right gap minus that of the signals, and the opposite of the left, in m."""
+        if (terms := self.nuisances) is None:
+            return 0.0
+        values = zip(terms.nuisances, terms.values(parameters), strict=True)
+        return sum(nuisance.size * float(z) for nuisance, z in values if nuisance.kind == "gap")
+
+    def nuisance_slope(self, key: NuisanceKey) -> Float1D:
+        """Return d residual / d nuisance, (entry,); zero for a nuisance of another log."""
+        slope = np.zeros(self.entry_row.size)
+        if self.nuisances is not None and key in self.nuisances.keys:
+            number, count = self.nuisances.keys.index(key), len(self.nuisances.keys)
+            column = self.nuisances.columns[number]
+            slope[: column.size] = column / self.weight
+            slope[slope.size - count + number] = 1.0
+        return slope
+
+    def force_errors(self, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
+        """Return measured minus modelled damper force, F_R and -F_L on a motion in N, (3, sample).
+
+        Without load cells the damper force is the sum of all forces.
+        """
+        model = parameters.model_for_log(self.log_number, m)
+        whole = SampledMotion(m, slice(None), m, self.contact_state)
+        return np.array(self._force_errors(model, parameters, whole))
+
+    def _force_errors(
+        self, model: Model, parameters: ParameterSet, sampled: SampledMotion
+    ) -> tuple[Float1D, Float1D, Float1D]:
+        """Return `force_errors` of the model of this log, (used,) each."""
+        m = sampled.m
+        d, right, left = self._model_forces(model, parameters, sampled)
+        if SLIP_SPEED in parameters.values:
+            d = d + model.break_away_force_n * (
+                np.tanh(m.v / parameters.values[SLIP_SPEED]) - np.where(m.v > 0, 1.0, -1.0)
+            )
+        if not m.has_load_cells and m.damper is None:
+            d = d + right + left
+        added = model.added_acceleration(m.table_disp)
+        if added is not None:
+            d = d + model.parameters.mass * added
+        left = -left
+        if any(isinstance(key, TermKey) for key in parameters.values):
+            p = model.parameters
+            generic = compute_generic_forces(
+                parameters.values, m, (p.gap_r, p.gap_l), sampled.contact, self.scale,
+                lambda hz: compute_resonator_force(sampled.whole, hz)[sampled.samples],
+            )  # fmt: skip
+            d, right, left = d + generic[0], right + generic[1], left + generic[2]
+        measured = self._measured_forces(m, model.parameters.mass, parameters)
+        return measured[0] - d, measured[1] - right, measured[2] - left
+
+    def _model_forces(
+        self, model: Model, parameters: ParameterSet, sampled: SampledMotion
+    ) -> Float2D:
+        """Return D, F_R >= 0 and F_L <= 0 of a model in N, (3, used)."""
+        zero_error = parameters.tare_error(self.log_number, "u")
+        if self._knows_contact and not depends_on_history(model):
+            m, contact = sampled.m, sampled.contact
+        else:
+            m, contact = sampled.whole, self.contact_state
+        added = model.added_acceleration(m.table_disp)
+        base_acc = m.table_acc if added is None else m.table_acc + added
+        forces = forces_along(model, m.u - zero_error, m.v, base_acc, m.time_s, contact)
+        return forces if m is sampled.m else forces[:, sampled.samples]
+
+    @cached_property
+    def _knows_contact(self) -> bool:
+        return bool((self.contact_state >= 0).all())
+
+    def evaluate_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> Float1D:
+        """Return the residual over its noise on a given motion, (entry,), without the rest row."""
+        return np.concatenate(self._list_rows(parameters, m))
+
+    def _list_rows(self, parameters: ParameterSet, m: MeasuredMotion) -> list[Float1D]:
+        """Return the rows of `evaluate_rows`, each at its own samples."""
+        model, sampled = parameters.model_for_log(self.log_number, m), self._sample_motion(m)
+        forces = self._force_errors(model, parameters, sampled)
+        # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
+        nominal_mass = model.parameters.mass * self.signals.mass_kg / m.mass_kg
+        noise = self.force_noise(m, nominal_mass)
+        places = self._row_places[: len(FORCE_ROWS)]
+        rows = [f[place] / rms for f, place, rms in zip(forces, places, noise, strict=True)]
+        if self.whitening is not None:
+            # the second derivative at an open end is no force, and the filter would spread it
+            damper = np.where(m.good, forces[0] / noise[0], 0.0)
+            rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
+        rows += [self._correct_consistency(c, parameters) for c in sampled.consistency]
+        if m.has_load_cells and m.damper is None:
+            rows += self._pull_rows(sampled, parameters, forces)
+        return rows
+
+    def _correct_consistency(
+        self, consistency: ConsistencyResidual, parameters: ParameterSet
+    ) -> Float1D:
+        """Return a consistency residual less the tare errors of the accelerometers, (sample,)."""
+        signs = {"mass": (1, 0), "table": (0, 1), "mass against table": (1, -1)}
+        mass, table = signs.get(consistency.body, (0, 0))
+        zero_error = mass * parameters.tare_error(
+            self.log_number, "acc"
+        ) + table * parameters.tare_error(self.log_number, "table")
+        return (
+            consistency.values - consistency.acc_sensitivity * zero_error
+            if zero_error
+            else consistency.values
+        )
+
+    def _pull_rows(
+        self, sampled: SampledMotion, parameters: ParameterSet, errors: Sequence[Float1D]
+    ) -> list[Float1D]:
+        """Return the tension of each side over the noise of its cells, in its row; 0 for pushes.
+
+        Where the model has tension, `errors` of the force rows enter as they are. Elsewhere the
+        mean square of pure noise is at most 1: only its negative half enters, scaled by sqrt(2),
+        and the undershoot of the low pass after a release is not counted as tension.
+        """
+        m = sampled.m
+        # a side without cells has no noise and no samples in these rows
+        sides = (
+            (m.right, "right", m.noise.right or 1.0),
+            (m.left, "left", m.noise.left or 1.0),
+        )
+        rows = []
+        for (push, name, rms), place, largest, error in zip(
+            sides, self._row_places[-len(PULL_ROWS) :], sampled.largest_pushes, errors[1:],
+            strict=True,
+        ):  # fmt: skip
+            measured = push[place] - parameters.tare_error(self.log_number, name)
+            tension = np.minimum(measured + MAX_UNDERSHOOT_SHARE * largest, 0.0) * math.sqrt(2.0)
+            is_held = error[place] > measured
+            rows.append(np.where(is_held, error[place], tension) / rms)
+        return rows
+
+    def _rest_entries(self, parameters: ParameterSet) -> Float1D:
+        """Return the rest row, (entry,): readings at rest less offsets, tare errors, over noise."""
+        offsets = {sensor.channel: sensor.offset for sensor in parameters.assumed_sensors()}
+        expected = [
+            (self.signals.rest_values[name], offsets.get(name, 0.0)) for name in self.rest_channels
+        ]
+        entries = [(mean - offset_si) / sigma for (mean, sigma), offset_si in expected]
+        for quantity, channels in self.signals.zero_channels.items():
+            mean, sigma = self.signals.rest_value(quantity)
+            offset_sum = sum(sign * offsets.get(name, 0.0) for name, sign in channels)
+            entries.append(
+                (mean - offset_sum - parameters.tare_error(self.log_number, quantity)) / sigma
+            )
+        return np.array(entries)
+
+
+def build_log_residuals(
+    logs: Sequence[tuple[LogSignals, float]], reference: Model, weights: Sequence[float] = ()
+) -> tuple[LogResiduals, ...]:
+    """Build the residuals of several logs, each (signals, contact threshold in N), on one scale."""
+    motions = [signals.fuse_motion() for signals, _ in logs]
+    readings: dict[str, float] = {}
+    for signals, _ in logs:
+        for channel in signals.channels:
+            readings[channel] = max(readings.get(channel, 0.0), signals.largest_reading(channel))
+    scale = measure_scale(motions, readings)
+    thinning = math.ceil(sum(int(m.moving.sum()) for m in motions) / MAX_SAMPLES) or 1
+    weighted = zip(logs, weights or [1.0] * len(logs), strict=True)
+    return tuple(
+        LogResiduals(number, signals, contact_n, reference, scale, weight, thinning)
+        for number, ((signals, contact_n), weight) in enumerate(weighted)
+    )
+
+
+def _bound_diverged(entries: Float1D) -> Float1D:
+    """Return the entries, changed in place to be finite and at most `MAX_RESIDUAL` in magnitude."""
+    if not -MAX_RESIDUAL <= entries.min(initial=0.0) <= entries.max(initial=0.0) <= MAX_RESIDUAL:
+        np.nan_to_num(entries, copy=False, nan=MAX_RESIDUAL)
+        np.clip(entries, -MAX_RESIDUAL, MAX_RESIDUAL, out=entries)
+    return entries

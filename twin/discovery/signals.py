@@ -1,0 +1,499 @@
+"""Signals of a log as spectra, and their fusion into a motion for assumed sensor models.
+
+Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit can vary them.
+"""
+
+import math
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.errors import InputError
+from twin.discovery.hum import remove_hum
+from twin.discovery.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
+from twin.discovery.noise import (
+    RestNoise,
+    compare_with_white,
+    estimate_noise_density,
+    measure_rest_noise,
+)
+from twin.discovery.spectra import (
+    FrequencyGrid,
+    Spectrum,
+    exclude_margins,
+)
+from twin.model.model import SensorModel
+
+LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
+OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
+# Of the power of a drive with a single frequency: within this width, of the frequency, about it.
+MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
+MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
+BODY_SENSORS = (
+    ("mass", "mass_disp_m", "mass_acc_m_s2"),
+    ("table", "table_disp_m", "table_acc_m_s2"),
+)
+SENSOR_PAIRS: Mapping[str, tuple[str, ...]] = {
+    **{body: (laser, accelerometer) for body, laser, accelerometer in BODY_SENSORS},
+    "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
+}
+CELL_PAIRS: Mapping[str, tuple[str, ...]] = {
+    "right cells": RIGHT_CELLS,
+    "left cells": LEFT_CELLS,
+}
+USED_CHANNELS = (
+    "rel_disp_m", "mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2",
+    *RIGHT_CELLS, *LEFT_CELLS, "damper_force_n",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class LogSignals:
+    """Signals of a log: spectrum and rms noise of each channel, specimen data and labels."""
+
+    name: str
+    mass_kg: float
+    gaps_m: tuple[float, float]
+    grid: FrequencyGrid
+    omega: Float1D
+    low_pass: Float1D
+    unit_spectrum: Spectrum
+    spectra: Mapping[str, Spectrum]
+    noise: Mapping[str, Float1D]  # density, (frequency,): white noise of rms s has the density s
+    rest_values: Mapping[str, tuple[float, float]]  # (mean, its std error) before the motion, SI
+    time_s: Float1D
+    step: Int1D
+    label: Int1D
+    cycle: Int1D
+    good: Bool2D
+    rest_noise: Mapping[str, RestNoise] = field(default_factory=dict)  # where there is a rest
+    surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return tuple(self.spectra)
+
+    @property
+    def filter_hz(self) -> float:
+        """Frequency where the slowest anti-alias filter begins to act; inf without one."""
+        return min((noise.roll_off_hz for noise in self.rest_noise.values()), default=math.inf)
+
+    @property
+    def zero_channels(self) -> dict[str, tuple[tuple[str, float], ...]]:
+        """Channels, with signs, that make up u, acc, table (its acceleration), right and left.
+
+        Only tared quantities: those with a rest value of every channel.
+        """
+        displacements = (("mass_disp_m", 1.0), ("table_disp_m", -1.0))
+        channels_of = {
+            "u": displacements if "mass_disp_m" in self.spectra else (("rel_disp_m", 1.0),),
+            "acc": (("mass_acc_m_s2", 1.0),),
+            "table": (("table_acc_m_s2", 1.0),),
+            "right": tuple((cell, 1.0) for cell in RIGHT_CELLS if cell in self.spectra),
+            "left": tuple((cell, 1.0) for cell in LEFT_CELLS if cell in self.spectra),
+        }
+        return {
+            name: channels
+            for name, channels in channels_of.items()
+            if channels and {channel for channel, _ in channels} <= self.rest_values.keys()
+        }
+
+    def channel_rms(self, channel: str) -> float:
+        """Return the rms of a channel about its mean while the drive moves, SI."""
+        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
+        return float(values.std()) if values.size else 0.0
+
+    def largest_reading(self, channel: str) -> float:
+        """Return the largest absolute reading of a channel while the drive moves, SI."""
+        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
+        return float(np.abs(values).max(initial=0.0))
+
+    @property
+    def relative_spectrum(self) -> Spectrum:
+        """Spectrum of the displacement of the mass relative to the table, from the lasers alone."""
+        if {"mass_disp_m", "table_disp_m"} <= self.spectra.keys():
+            return self.spectra["mass_disp_m"] - self.spectra["table_disp_m"]
+        return self.spectra["rel_disp_m"]
+
+    def rest_value(self, name: str) -> tuple[float, float]:
+        """Return (mean, standard error) of one of `zero_channels` at rest, SI.
+
+        With precompression the readings at rest are real: the mean is then 0, because only the
+        standard error of the tare is known.
+        """
+        rest = [(sign, *self.rest_values[channel]) for channel, sign in self.zero_channels[name]]
+        pressed = min(self.gaps_m) <= 0
+        mean = 0.0 if pressed else sum(sign * mean for sign, mean, _ in rest)
+        return mean, float(np.hypot.reduce([sd for _, _, sd in rest])) / float(np.sqrt(2.0))
+
+    def whitening(self, stiffness: float, damping: float) -> Float1D:
+        """Return the whitening filter of the force balance without accelerometer, (frequency,).
+
+        It is a gain per kg that makes the noise white with rms 1 where the acceleration of the mass
+        comes from its displacement. The noise of u then enters through -w^2 u and K u + C u': for a
+        stiffness in N/(m kg) and a damping in N s/(m kg) it is s_u |K - w^2 + i w C|, small where
+        the signal is large.
+        """
+        displacement = "rel_disp_m" if "rel_disp_m" in self.noise else "mass_disp_m"
+        s_u = self.noise[displacement] * np.abs(
+            stiffness - self.omega**2 + 1j * self.omega * damping
+        )
+        gain: Float1D = self.low_pass / np.hypot(s_u, self.noise["table_acc_m_s2"])
+        return gain / self.grid.white_noise_rms(self.low_pass)
+
+    def balance_noise(self, stiffness: float, damping: float) -> float:
+        """Return the rms noise in m/s2 of the force balance without accelerometer, per kg.
+
+        The parameters are those of `whitening`: this is the noise that it makes white.
+        """
+        gain = self.whitening(stiffness, damping) * self.grid.white_noise_rms(self.low_pass)
+        density = np.divide(self.low_pass, gain, out=np.zeros_like(gain), where=gain > 0)
+        return self.grid.white_noise_rms(density * self.low_pass)
+
+    def calibrate_noise(self) -> "LogSignals":
+        """Return the signals with the noise of laser and accelerometer as loud as they disagree.
+
+        No force law can make the two sensors of a body disagree: what exceeds the noise seen at
+        rest is noise in motion (light spot, resolution, drift).
+        """
+        noise = dict(self.noise)
+        if not self.good.any():
+            return self
+        share = float(self.good.mean())
+        for residual in self.fuse_motion().consistency_residuals:
+            channels = SENSOR_PAIRS.get(residual.body, ())
+            # an offset would leak over the cuts at lost samples
+            offset = residual.values[self.good].mean() if share < 1.0 else 0.0
+            values = np.where(self.good, residual.values - offset, 0.0) / math.sqrt(share)
+            ratio = np.sqrt(compare_with_white(values, self.low_pass))
+            ratio = np.minimum(ratio, MAX_NOISE_RATIO)
+            noise |= {name: noise[name] * ratio for name in channels if name in noise}
+        return replace(self, noise=noise)
+
+    def fuse_motion(self, sensors: Sequence[SensorModel] = ()) -> MeasuredMotion:
+        """Return the motion, assuming that these sensors read gain x value(t - lag) + offset.
+
+        The noise is that of the readings as they are: scaled by an assumed gain, it would let the
+        misfit shrink by its own denominator.
+        """
+        return self._fusion.fuse(self.spectra, sensors)
+
+    def fuse_corrected(self, corrected: "LogSignals") -> MeasuredMotion:
+        """Return the motion of corrected signals: with the noise of these, and most spectra."""
+        return replace(self._fusion.fuse(corrected.spectra), gaps_m=corrected.gaps_m)
+
+    @cached_property
+    def _fusion(self) -> "_SensorFusion":
+        return _SensorFusion(self)
+
+
+def derives_acc(channels: Container[str]) -> bool:
+    """Return True if the acceleration of the mass is derived from its displacement."""
+    return "mass_acc_m_s2" not in channels and "table_acc_m_s2" in channels
+
+
+@dataclass(frozen=True, slots=True)
+class _ChannelWeights:
+    """Share of a displacement or acceleration in the fusion, gains by frequency, (frequency,)."""
+
+    u: Float1D
+    body: str = ""  # of its sensor-consistency residual
+    consistency: Float1D | None = None
+
+
+class _SensorFusion:
+    """Minimum-variance fusion of displacement and acceleration spectra into one motion.
+
+    It is linear: every channel adds its own series, (sample,), to those of the motion. The series
+    of the channels as read are computed once; gain and offset of a sensor only scale and shift.
+    """
+
+    def __init__(self, signals: LogSignals) -> None:
+        self.signals, self.noise = signals, signals.noise
+        self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
+        self.kept_share = self.grid.white_noise_rms(self.low_pass)
+        self.weights: dict[str, _ChannelWeights] = {}
+        self.sensitivity: dict[str, float] = {}  # of the consistency residuals
+        if {"mass_disp_m", "table_disp_m"} <= signals.spectra.keys():
+            densities = [
+                self._weigh(body, sign, laser, {accelerometer: 1.0})
+                for (body, laser, accelerometer), sign in zip(BODY_SENSORS, (1, -1), strict=True)
+            ]
+        else:
+            accelerometers = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
+            densities = [self._weigh("mass against table", 1, "rel_disp_m", accelerometers)]
+        density = np.hypot.reduce(densities) * self.low_pass
+        # the surface noise is too slow for the low pass
+        surface = math.sqrt(len(densities)) * signals.surface_noise_m
+        rms = self._filtered_rms
+        self.motion_noise = MotionNoise(
+            math.hypot(self.grid.white_noise_rms(density), surface),
+            self.grid.white_noise_rms(self.omega * density),
+            rms("mass_acc_m_s2"), self._side_noise(RIGHT_CELLS), self._side_noise(LEFT_CELLS),
+            rms("damper_force_n"),
+        )  # fmt: skip
+        self.cell_noise = {side: self._side_noise(cells) for side, cells in CELL_PAIRS.items()}
+        self.series: dict[str, dict[str, Float1D]] = {}
+        self.unit_series: dict[str, dict[str, Float1D]] = {}  # of readings of 1 SI
+
+    def _weigh(
+        self, body: str, sign: int, laser: str, accelerometers: Mapping[str, float]
+    ) -> Float1D:
+        """Set the weights of the sensors of a body; return the density of its fused noise.
+
+        With a `sign` for each accelerometer: mass less table, where the laser reads their distance.
+        """
+        s_x = self.noise[laser]
+        if not accelerometers.keys() <= self.signals.spectra.keys():
+            self.weights[laser] = _ChannelWeights(sign * self.low_pass)
+            return s_x
+        s_a, w2 = np.hypot.reduce([self.noise[name] for name in accelerometers]), self.omega**2
+        variance = s_a**2 + w2**2 * s_x**2
+        residual = self.low_pass / np.sqrt(variance) / self.kept_share
+        self.weights[laser] = _ChannelWeights(
+            sign * s_a**2 / variance * self.low_pass, body, w2 * residual
+        )
+        for name, own_sign in accelerometers.items():
+            self.weights[name] = _ChannelWeights(
+                -sign * own_sign * w2 * s_x**2 / variance * self.low_pass, body, own_sign * residual
+            )
+        self.sensitivity[body] = 1.0 / (float(np.sqrt(variance[0])) * self.kept_share)
+        density: Float1D = s_a * s_x / np.sqrt(variance)
+        return density
+
+    def fuse(
+        self, spectra: Mapping[str, Spectrum], sensors: Sequence[SensorModel] = ()
+    ) -> MeasuredMotion:
+        """Return the motion of the spectra of all channels, for assumed sensors."""
+        signals, assumed = self.signals, {sensor.channel: sensor for sensor in sensors}
+        shares = {
+            channel: self._read(channel, spectrum, assumed.get(channel))
+            for channel, spectrum in spectra.items()
+        }
+        missing = np.full(signals.time_s.size, np.nan)
+
+        def add(name: str, channels: Sequence[str] = USED_CHANNELS) -> Float1D:
+            """Return the sum of one series of the channels that have it; NaN without any."""
+            parts = [shares[c][name] for c in channels if c in shares and name in shares[c]]
+            total = parts[0] if parts else missing
+            if len(parts) > 1:
+                total = parts[0] + parts[1]
+                for part in parts[2:]:
+                    total += part
+            return total
+
+        right, left = add("read", RIGHT_CELLS), add("read", LEFT_CELLS)
+        noise = self.motion_noise
+        # a side without a bumper needs no cells: its force is zero
+        if np.isfinite(noise.right) and np.isnan(noise.left):
+            left, noise = np.zeros(missing.size), replace(noise, left=0.0)
+        elif np.isfinite(noise.left) and np.isnan(noise.right):
+            right, noise = np.zeros(missing.size), replace(noise, right=0.0)
+        consistency = [
+            ConsistencyResidual(body, add(body), sensitivity)
+            for body, sensitivity in self.sensitivity.items()
+        ]
+        for side, (first, second) in CELL_PAIRS.items():
+            if {first, second} <= spectra.keys():
+                difference = shares[first]["read"] - shares[second]["read"]
+                difference /= self.cell_noise[side]
+                consistency.append(ConsistencyResidual(side, difference))
+        acc = add("read", ["mass_acc_m_s2"])
+        if derives_acc(spectra):
+            acc = add("relative acc") + add("read", ["table_acc_m_s2"])
+        return MeasuredMotion(
+            signals.name, self.grid.rate_hz / self.grid.decimation, signals.mass_kg,
+            signals.gaps_m, signals.time_s, add("u"), add("v"), acc,
+            add("read", ["table_acc_m_s2"]), add("read", ["table_disp_m"]), right, left,
+            signals.step, signals.label, signals.cycle, signals.good, noise, tuple(consistency),
+            add("read", ["damper_force_n"]) if "damper_force_n" in spectra else None,
+        )  # fmt: skip
+
+    def _read(
+        self, channel: str, spectrum: Spectrum, sensor: SensorModel | None
+    ) -> dict[str, Float1D]:
+        """Return the series of a channel, of which the sensor reads gain x value(t - lag) + offset.
+
+        Those of the channels as read are cached.
+        """
+        if sensor is not None and sensor.lag:
+            tared = spectrum - sensor.offset * self.signals.unit_spectrum
+            series = self._filter(channel, tared * np.exp(1j * self.omega * sensor.lag))
+        elif spectrum is not self.signals.spectra[channel]:
+            series = self._filter(channel, spectrum)
+        else:
+            if channel not in self.series:
+                self.series[channel] = self._filter(channel, spectrum)
+            series = self.series[channel]
+        if sensor is not None and sensor.offset and not sensor.lag:
+            if channel not in self.unit_series:
+                self.unit_series[channel] = self._filter(channel, self.signals.unit_spectrum)
+            unit = self.unit_series[channel]
+            series = {name: values - sensor.offset * unit[name] for name, values in series.items()}
+        if sensor is not None and sensor.gain != 1.0:
+            series = {name: values / sensor.gain for name, values in series.items()}
+        return series
+
+    def _filter(self, channel: str, spectrum: Spectrum) -> dict[str, Float1D]:
+        """Return the series of a channel: its share in u, v, ..., and the readings themselves."""
+        series, weights = {}, self.weights.get(channel)
+        if weights is not None:
+            position = spectrum * weights.u
+            series["u"] = self.grid.to_time_domain(position)
+            series["v"] = self.grid.to_time_domain(1j * self.omega * position)
+            if derives_acc(self.signals.spectra):
+                series["relative acc"] = self.grid.to_time_domain(-(self.omega**2) * position)
+            if weights.consistency is not None:
+                series[weights.body] = self.grid.to_time_domain(spectrum * weights.consistency)
+        if channel not in ("rel_disp_m", "mass_disp_m"):
+            series["read"] = self.grid.to_time_domain(spectrum * self.low_pass)
+        return series
+
+    def _filtered_rms(self, name: str) -> float:
+        """Return the rms noise of a channel after the low pass, SI; NaN without the channel."""
+        if name not in self.noise:
+            return float("nan")
+        return self.grid.white_noise_rms(self.noise[name] * self.low_pass)
+
+    def _side_noise(self, cells: tuple[str, ...]) -> float:
+        """Return the rms noise of the force of a side in N; NaN without load cells."""
+        present = [self._filtered_rms(name) for name in cells if name in self.signals.spectra]
+        return float(np.hypot.reduce(present)) if present else float("nan")
+
+
+def build_signals(
+    blocks: tuple[Block, ...], name: str, mass_kg: float, gaps_m: tuple[float, float]
+) -> LogSignals:
+    """Build the signals of measured blocks; raise InputError if no displacement was measured."""
+    block = _join_with_gaps(blocks, name)
+    columns = {
+        key: block.channel(key)
+        for key in USED_CHANNELS
+        if key in block.channels and is_channel_alive(block.channel(key))
+    }
+    if find_unmeasured_side(columns, gaps_m):
+        columns = {
+            key: values for key, values in columns.items() if key not in (*RIGHT_CELLS, *LEFT_CELLS)
+        }
+    if "rel_disp_m" not in columns and not {"mass_disp_m", "table_disp_m"} <= columns.keys():
+        raise InputError(
+            "the displacement of the mass relative to the table was not measured",
+            where=name,
+            allowed="logs with rel_disp_m, or with mass_disp_m and table_disp_m",
+        )
+    at_rest = _find_rest(block)
+    good = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
+    grid = FrequencyGrid(len(block), block.rate_hz)
+    usable = exclude_margins(good, round(LOST_MARGIN_S * block.rate_hz))
+    margin = round(OPEN_END_S * block.rate_hz)
+    if block.label[0] != Label.REST:
+        usable[:margin] = False
+    if block.label[-1] != Label.REST:
+        usable[-margin:] = False
+    size = -(-len(block) // grid.decimation)
+    spectra = {key: grid.to_spectrum(values) for key, values in columns.items()}
+    frequency = grid.omega / (2 * np.pi * block.rate_hz)
+    noise = {
+        key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
+    }
+    measured = {
+        key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
+    }
+    rest_noise = {key: value for key, value in measured.items() if value is not None}
+    return LogSignals(
+        name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
+        grid.to_spectrum(np.ones(len(block))), remove_hum(spectra, grid, at_rest), noise,
+        _measure_rest(columns, at_rest, noise),
+        (block.index + grid.decimation * np.arange(size)) / block.rate_hz,
+        block.step[:: grid.decimation], block.label[:: grid.decimation],
+        block.cycle[:: grid.decimation],
+        usable[:: grid.decimation],
+        rest_noise,
+    )  # fmt: skip
+
+
+def has_single_frequency(signals: LogSignals) -> bool:
+    """Return True if the drive has one frequency: most of its power lies about its main line.
+
+    The drive is the motion of the table where it was measured, else that of the mass.
+    """
+    table = ("table_acc_m_s2", "table_disp_m")
+    channel = next((name for name in table if name in signals.channels), "rel_disp_m")
+    values = signals.grid.to_time_domain(signals.spectra[channel])[signals.label != Label.REST]
+    window = np.hanning(values.size)
+    power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
+    if not power.sum() > 0:
+        return False
+    line = np.arange(power.size)
+    main = int(power[1:].argmax()) + 1
+    about_main = np.abs(line - main) <= max(SINGLE_LINE_WIDTH * main, 3.0)
+    return float(power[about_main].sum() / power.sum()) > MIN_SINGLE_LINE_SHARE
+
+
+def find_unmeasured_side(channels: Container[str], gaps_m: tuple[float, float]) -> str:
+    """Return "right" or "left" if only the other side's bumper force was measured, else "".
+
+    Half of the bumper forces is worse than none: the balance of the mass gives their sum. A side
+    without a bumper needs no cells.
+    """
+    sides = {"right": (RIGHT_CELLS, gaps_m[0]), "left": (LEFT_CELLS, gaps_m[1])}
+    measured = {side for side, (cells, _) in sides.items() if any(c in channels for c in cells)}
+    missing = [side for side, (_, gap) in sides.items() if gap < np.inf and side not in measured]
+    return missing[0] if measured and missing else ""
+
+
+def is_channel_alive(values: Float1D) -> bool:
+    """Return False for a dead channel: no samples, or a constant value."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size and np.ptp(finite) > 0.0)
+
+
+def _join_with_gaps(blocks: tuple[Block, ...], name: str) -> Block:
+    """Join blocks into one; missing samples between them become NaN."""
+    if not blocks:
+        raise InputError(
+            "the log has no measured samples", where=name, remedy="give a recorded test"
+        )
+    parts: list[Block] = []
+    for block in blocks:
+        if parts and parts[-1].end < block.index:
+            parts.append(_missing_block(parts[-1], block.index))
+        parts.append(block)
+    return join_blocks(parts)
+
+
+def _missing_block(before: Block, until: int) -> Block:
+    count = until - before.end
+    outside = np.full(count, -1, dtype=np.int64)
+    values = np.full((len(before.channels), count), np.nan)
+    label = np.zeros(count, dtype=np.int64)
+    return Block(
+        before.stream, before.end, before.rate_hz, before.channels, values, outside, label, outside
+    )
+
+
+def _find_rest(block: Block) -> Bool2D:
+    """Find the samples at rest before the motion, (sample,): there all readings are noise."""
+    moving = np.flatnonzero(block.label != Label.REST)
+    at_rest = np.zeros(len(block), dtype=bool)
+    at_rest[: moving[0] if moving.size else 0] = True
+    return at_rest
+
+
+def _measure_rest(
+    columns: Mapping[str, Float1D], at_rest: Bool2D, noise: Mapping[str, Float1D]
+) -> dict[str, tuple[float, float]]:
+    """Return (mean, std error) of each channel at rest, SI; the tare's own error is included."""
+    rest_values = {}
+    for key, values in columns.items():
+        finite = values[at_rest & np.isfinite(values)]
+        if finite.size >= 100:
+            rest_values[key] = (
+                float(finite.mean()),
+                float(noise[key][1]) * float(np.sqrt(2.0 / finite.size)),
+            )
+    return rest_values

@@ -1,0 +1,1 @@
+"""Plot style, panels and the shell of a page."""

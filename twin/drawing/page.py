@@ -1,0 +1,47 @@
+"""HTML pages: template rendering and embedded figures."""
+
+import base64
+import math
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+
+from twin.drawing.plot_style import Picture
+
+TEMPLATE_DIR = Path(__file__).parent  # contains the shared parts.html and style.html
+
+
+MAX_PLAIN = 1e12  # larger numbers are written as a power of ten
+
+
+def format_significant(value: Any, digits: int = 3) -> str:
+    """Format a number with `digits` significant digits, never in E notation; a dash if invalid."""
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return "–"
+    if value == 0:
+        return "0"
+    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    if decimals > 9 or abs(value) >= MAX_PLAIN:
+        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+        return f"{mantissa}·10^{int(exponent)}".replace("-", "−")
+    return f"{value:.{decimals}f}".replace("-", "−")
+
+
+def render_page(template: Path, **values: Any) -> str:
+    """Render a template as HTML text; values are escaped, a missing variable is an error."""
+    environment = Environment(
+        loader=FileSystemLoader([template.parent, TEMPLATE_DIR]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["sig"] = format_significant
+    return environment.get_template(template.name).render(**values)
+
+
+def embed_images(pictures: Iterable[Picture]) -> list[tuple[Picture, str]]:
+    """Return (picture, its PNG in base64) pairs for embedding in a page."""
+    return [(picture, base64.b64encode(picture.path.read_bytes()).decode()) for picture in pictures]

@@ -1,0 +1,237 @@
+"""Figures of selected steps: time histories, phase portraits and force loops.
+
+Steps come from `report_data.select_frequencies`: at most four frequencies, both directions each.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from twin.drawing.motion_drawing import (
+    draw_rest_lines,
+    plot_bumper_loops,
+    plot_history,
+    plot_inertia_loop,
+    plot_phase_portrait,
+    shade_contact,
+)
+from twin.drawing.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    REST_LINE_STYLE,
+    TWIN_COLOUR,
+    CaptionedFigure,
+    CaptionedFigures,
+    direction_handles,
+    measured_style,
+    twin_style,
+)
+from twin.results.report_data import (
+    DIRECTIONS,
+    ReportData,
+    StepMotion,
+    pair_motions,
+    select_frequencies,
+)
+
+HISTORY_CYCLES = 3
+CONTACT_ALPHAS = 0.22, 0.10  # right, left
+BAND_COLOUR = "#cfe8d5"
+
+
+def draw_legend(
+    run: ReportData, figure: Figure, *handles: Line2D | Patch, marker: str = ""
+) -> None:
+    """Draw the legend of measured and twin lines above the panels."""
+    lines: list[Line2D | Patch] = []
+    directions = [
+        direction
+        for direction in DIRECTIONS
+        if any(step["direction"] == direction for step in run.steps)
+    ]
+    if run.source == "measured":
+        lines += direction_handles(
+            lambda direction: measured_style(direction) | {"marker": marker},
+            "measured ",
+            directions,
+        )
+    lines += direction_handles(twin_style, "twin ", directions)
+    figure.legend(handles=[*lines, *handles], loc="outside upper center", ncols=6)
+
+
+def draw_histories(run: ReportData) -> CaptionedFigures:
+    """Draw u, a and contact forces over the last cycles, one figure per frequency (Figs. 7, 12)."""
+    for hz, reason in select_frequencies(run).items():
+        motions = pair_motions(run, hz)
+        rows = 3 if run.has_bumpers else 2
+        if not motions:
+            continue
+        has_residuals = any(measured and twin for _, measured, twin in motions)
+        heights = [2.0, 0.9] * rows if has_residuals else [2.0] * rows
+        figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.8 * sum(heights) + 0.6))
+        axes = figure.subplots(
+            len(heights), len(motions), sharex="col", sharey="row", squeeze=False,
+            height_ratios=heights,
+        )  # fmt: skip
+        stride = 2 if has_residuals else 1
+        for column, (direction, measured, twin) in zip(axes.T, motions, strict=True):
+            histories = column[::stride]
+            histories[0].set_title(f"{direction}, {hz:g} Hz")
+            column[-1].set_xlabel("time in s")
+            for motion, style in (
+                (measured, measured_style(direction)),
+                (twin, twin_style(direction)),
+            ):
+                if motion is not None:
+                    plot_history(histories, motion.select_last(HISTORY_CYCLES), **style)
+            contact_motion = twin if run.source == "twin" or measured is None else measured
+            if contact_motion is not None:
+                shown, colour = (
+                    contact_motion.select_last(HISTORY_CYCLES),
+                    DIRECTION_COLOURS[direction],
+                )
+                for ax in histories:
+                    shade_contact(ax, shown, colour, CONTACT_ALPHAS, run.contact_n)
+            if run.gaps_m is not None:
+                draw_rest_lines(run.gaps_m, histories[0].axhline)
+            if has_residuals and measured and twin:
+                _draw_residuals(
+                    column[1::2],
+                    measured.select_last(HISTORY_CYCLES),
+                    twin.select_last(HISTORY_CYCLES),
+                    _find_bands(run, direction, hz),
+                )
+        labels = ("$u$ in mm", "$a$ in m/s²", "$F_R$, $F_L$ in kN")
+        for ax, label in zip(axes[::stride, 0], labels, strict=False):
+            ax.set_ylabel(label)
+        for ax in axes[1::2, 0] if has_residuals else ():
+            ax.set_ylabel("residual")
+        handles: list[Line2D | Patch] = _gap_line_handles(run)
+        if has_residuals:
+            handles.append(Patch(color=BAND_COLOUR, label="tolerance"))
+        draw_legend(run, figure, *handles)
+        caption = (
+            "Last measured cycles; below each history, measured minus twin in the same unit, and "
+            "the tolerance of the restarted twin. Shaded: contact, dark for the right bumper, "
+            "light for the left. "
+            "The twin is free-running on the measured table acceleration; a chaotic motion cannot "
+            "be reproduced sample by sample."
+        )
+        title = f"Histories at {hz:g} Hz: {reason}"
+        yield CaptionedFigure(f"histories_{hz:g}hz", title, caption, figure)
+
+
+def _find_bands(run: ReportData, direction: str, hz: float) -> dict[str, float]:
+    """Return the tolerance of u in m and of a in m/s2 at a step; empty if it is unknown."""
+    for step in run.steps:
+        if step["direction"] == direction and step["frequency_hz"] == hz:
+            return {name: entry["band"] for name, entry in (step.get("agreement") or {}).items()}
+    return {}
+
+
+def _draw_residuals(
+    axes: Sequence[Axes], measured: StepMotion, twin: StepMotion, bands: dict[str, float]
+) -> None:
+    """Draw measured minus twin of u, a and the forces, each with its tolerance band."""
+    count = min(measured.time.size, twin.time.size)
+    scales = (("u", 1e3, "rel_disp_m"), ("a", 1.0, "mass_acc_m_s2"))
+    for ax, (name, scale, channel) in zip(axes, scales, strict=False):
+        difference = getattr(measured, name)[:count] - getattr(twin, name)[:count]
+        ax.plot(measured.time[:count], scale * difference, color=TWIN_COLOUR, lw=0.8)
+        if channel in bands:
+            half = scale * bands[channel]
+            ax.axhspan(-half, half, color=BAND_COLOUR, lw=0, zorder=0.4)
+    for ax in axes[2:]:
+        for name in ("force_r", "force_l"):
+            difference = getattr(measured, name)[:count] - getattr(twin, name)[:count]
+            ax.plot(measured.time[:count], difference / 1e3, color=TWIN_COLOUR, lw=0.8)
+    for ax in axes:
+        ax.axhline(0, color=GUIDE_COLOUR, lw=0.5)
+
+
+def _gap_line_handles(run: ReportData) -> list[Line2D | Patch]:
+    if run.gaps_m is None:
+        return []
+    name = "bumper at rest" if min(run.gaps_m) >= 0 else "precompression"
+    return [Line2D([], [], **REST_LINE_STYLE, label=name)]
+
+
+def draw_loop_figures(run: ReportData) -> CaptionedFigures:
+    """Draw phase portraits, inertia force loops and bumper loops (Figs. 3, 6, 9 and 11)."""
+    mass = run.specimen.mass_kg if run.specimen else None
+    columns = {hz: motions for hz in select_frequencies(run) if (motions := pair_motions(run, hz))}
+
+    def plot_inertia(ax: Axes, motion: StepMotion, **style: Any) -> None:
+        plot_inertia_loop(ax, motion, mass or np.nan, **style)
+
+    yield from _draw_grid(
+        run, columns, plot_phase_portrait,
+        ("portraits", "Phase portraits", "$u$ in mm", "$u'$ in mm/s"),
+        "Relative velocity u' over relative displacement u, all measured cycles. The measured u' "
+        "is a Savitzky-Golay derivative of u over 20 ms, used only in this figure.",
+    )  # fmt: skip
+    if mass is not None:
+        yield from _draw_grid(
+            run, columns, plot_inertia,
+            ("loops", "Inertia force loops", "$u$ in mm", "$F_I$ in kN"),
+            "Inertia force F_I = −M a against relative displacement.",
+        )  # fmt: skip
+    if run.has_bumpers:
+        yield from _draw_grid(
+            run, columns, plot_bumper_loops,
+            ("bumpers", "Bumper loops", "$v_j$ in mm", "$F_j$ in kN"),
+            "Contact force over bumper position, right positive, left negative. In contact the "
+            "bumper moves with the mass, v_j = u; flight is not shown.",
+        )  # fmt: skip
+
+
+def _draw_grid(
+    run: ReportData,
+    columns: dict[float, list[tuple[str, StepMotion | None, StepMotion | None]]],
+    plot: Callable[..., None],
+    names: tuple[str, str, str, str],
+    caption: str,
+) -> CaptionedFigures:
+    """Draw one figure with a column per frequency and a row per direction."""
+    directions = [
+        direction
+        for direction in DIRECTIONS
+        if any(direction == entry[0] for entries in columns.values() for entry in entries)
+    ]
+    if not directions:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * len(directions) + 0.6))
+    axes = figure.subplots(
+        len(directions), max(len(columns), 3), sharex="col", sharey="col", squeeze=False
+    )
+    for ax in axes[:, len(columns) :].flat:
+        ax.remove()
+    for column, (hz, motions) in zip(axes.T, columns.items(), strict=False):
+        for direction, measured, twin in motions:
+            ax = column[directions.index(direction)]
+            ax.axhline(0, color=GUIDE_COLOUR, lw=0.5)
+            ax.set_title(f"{hz:g} Hz {direction}")
+            for motion, style in (
+                (measured, measured_style(direction)),
+                (twin, twin_style(direction)),
+            ):
+                if motion is not None:
+                    plot(ax, motion, **style)
+            if not any(np.isfinite(line.get_xydata()).all(axis=1).any() for line in ax.lines[1:]):
+                ax.text(
+                    0.5, 0.6, "no contact", transform=ax.transAxes, ha="center", color=GUIDE_COLOUR
+                )
+                ax.set_yticks([0])
+            if run.gaps_m is not None:
+                draw_rest_lines(run.gaps_m, ax.axvline)
+        column[-1].set_xlabel(names[2])
+    for ax in axes[:, 0]:
+        ax.set_ylabel(names[3])
+    draw_legend(run, figure, *_gap_line_handles(run))
+    yield CaptionedFigure(names[0], names[1], caption, figure)

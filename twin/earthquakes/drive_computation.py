@@ -1,0 +1,152 @@
+"""Drive: the command by which a table follows its target, from its twin and from earlier runs.
+
+A target motion is played on the table's twin, and what the twin lacks is added to the command
+through the inverse of its linear frequency response, until nothing more is gained: the inverse of
+the nonlinear twin within the band. What a real run lacks is added in the same way, which is the
+usual iteration of a laboratory (for instance De Cuyper, Swevers, Mech. Syst. Signal Process. 2003);
+friction, valve and impacts are then those of the last run.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.fft import next_fast_len
+
+from table_io.block import Float1D
+from table_io.config.excitation.waveform import smoothstep
+from twin.earthquakes.table_identification import CROSSOVER_HZ
+from twin.earthquakes.table_model import TableModel
+
+BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
+MAX_AMPLIFICATION = 5.0  # of the inverse
+MAX_ROUNDS = 25
+LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
+SMOOTHING_HZ = 0.5  # of the ratio of what a run lacked to the noise
+PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its beginning
+
+
+@dataclass(frozen=True, eq=False)
+class ComputedDrive:
+    """Command in m, (sample,), and the twin's expected acceleration error in the band, relative."""
+
+    command_m: Float1D
+    expected_error: float
+
+
+def compute_drive(
+    model: TableModel,
+    target_m: Float1D,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+    reaction_n: Float1D | None = None,
+) -> ComputedDrive:
+    """Compute the command for a target displacement in m, (sample,), at rest at both ends.
+
+    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion.
+    """
+    command = compute_correction(target_m, model, rate_hz, band_hz)
+    best, best_error, step = command, math.inf, 1.0
+    for _ in range(MAX_ROUNDS):
+        achieved = model.simulate(command, rate_hz, reaction_n)[0]
+        error = measure_error(achieved, target_m, rate_hz, band_hz)
+        if error >= best_error:
+            step *= 0.5
+            if step < 0.2:
+                break
+        else:
+            if best_error - error < LEAST_GAIN * best_error:
+                best, best_error = command, error
+                break
+            best, best_error, lacking = command, error, target_m - achieved
+        command = best + step * compute_correction(lacking, model, rate_hz, band_hz)
+    return ComputedDrive(best, best_error)
+
+
+def compute_correction(
+    lacking_m: Float1D, model: TableModel, rate_hz: float, band_hz: tuple[float, float]
+) -> Float1D:
+    """Return the command for what the table lacks in m, (sample,), by the linear inverse."""
+    count = lacking_m.size
+    padding = round(PADDING_S * rate_hz)
+    size = next_fast_len(count + 2 * padding)
+    spectrum = np.fft.rfft(lacking_m, size)
+    frequency_hz = np.fft.rfftfreq(size, 1.0 / rate_hz)
+    inverse = _invert_response(model, np.asarray(frequency_hz, float), band_hz[1])
+    correction = np.fft.irfft(spectrum * inverse, size)
+    # The inverse leads: what it asks for before the first sample lies at the end of the period.
+    limited: Float1D = correction[:count] * _rest_at_ends(count, rate_hz)
+    return limited
+
+
+@dataclass(frozen=True, eq=False)
+class PlayedDrive:
+    """A run of a drive: command and achieved table in m, specimen's force in N, (sample,) each.
+
+    `noise_m` is the rms of the laser's noise in m, `noise_m_s2` that of the accelerometer's.
+    """
+
+    command_m: Float1D
+    achieved_m: Float1D
+    reaction_n: Float1D
+    noise_m: float
+    noise_m_s2: float
+
+
+def correct_played_drive(
+    run: PlayedDrive,
+    model: TableModel,
+    target_m: Float1D,
+    reaction_n: Float1D,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+) -> Float1D:
+    """Return the next command, (sample,), for a target in m with the specimen's force in N.
+
+    What another force of the specimen did in the run, for instance an impact at another time, is
+    taken out by the twin: the next run will not repeat it. What is no larger than the noise of the
+    sensors is left.
+    """
+    by_target, by_run = (
+        model.simulate(run.command_m, rate_hz, force)[0] for force in (reaction_n, run.reaction_n)
+    )
+    lacking = target_m - (run.achieved_m + by_target - by_run)
+    spectrum = np.fft.rfft(lacking)
+    frequency_hz = np.fft.rfftfreq(lacking.size, 1.0 / rate_hz)
+    square = np.where(frequency_hz > 0.0, (math.tau * frequency_hz) ** 2, 1.0)
+    slow = frequency_hz < CROSSOVER_HZ
+    noise = lacking.size * np.where(slow, run.noise_m, run.noise_m_s2 / square) ** 2
+    width = max(round(SMOOTHING_HZ * lacking.size / rate_hz), 1)
+    ratio = np.convolve(np.abs(spectrum) ** 2 / noise, np.ones(width) / width, mode="same")
+    known = np.fft.irfft(spectrum * np.clip(1.0 - 1.0 / ratio, 0.0, 1.0), lacking.size)
+    return run.command_m + compute_correction(known, model, rate_hz, band_hz)
+
+
+def measure_error(
+    achieved_m: Float1D, target_m: Float1D, rate_hz: float, band_hz: tuple[float, float]
+) -> float:
+    """Return the rms error of acceleration in a band over that of the target, from m."""
+    frequency_hz = np.fft.rfftfreq(target_m.size, 1.0 / rate_hz)
+    inside = (frequency_hz >= band_hz[0]) & (frequency_hz <= band_hz[1])
+    square = frequency_hz[inside] ** 2
+    error = np.fft.rfft(achieved_m - target_m)[inside] * square
+    return float(np.linalg.norm(error) / np.linalg.norm(np.fft.rfft(target_m)[inside] * square))
+
+
+def _invert_response(
+    model: TableModel, frequency_hz: Float1D, highest_hz: float
+) -> npt.NDArray[np.complex128]:
+    """Return the inverse of the linear response, tapered above the band and bounded."""
+    response = model.frequency_response(frequency_hz)
+    size = np.maximum(np.abs(response), 1.0 / MAX_AMPLIFICATION)
+    beyond = (frequency_hz / highest_hz - 1.0) / (BAND_EDGE_RATIO - 1.0)
+    taper = np.cos(0.5 * math.pi * np.clip(beyond, 0.0, 1.0)) ** 2
+    inverse: npt.NDArray[np.complex128] = np.conj(response) / size**2 * taper
+    return inverse
+
+
+def _rest_at_ends(count: int, rate_hz: float) -> Float1D:
+    """Return a window that is 1 but for half a second at either end, where it rises from 0."""
+    edge = np.arange(count) / (0.5 * rate_hz)
+    return smoothstep(np.minimum(edge, edge[::-1]))

@@ -1,0 +1,136 @@
+"""`run`: run a test on the table, in real time or at full speed."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+
+from table_io.clock import RealClock, local_datetime
+from table_io.config.base import parse_toml
+from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
+from twin.cli.live_commands import start_page
+from twin.model.config import ModelConfig
+from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
+from twin.security.credentials import Credentials, credentials_folder
+from twin.setup.disk import require_disk_space
+from twin.setup.folders import RUNS_FOLDER, make_run_folder
+from twin.setup.realtime import check_full_speed, check_realtime
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.warm_up import compile_kernels
+from twin.system.progress import RunProgress
+from twin.system.terminal import catch_interrupts, console, print_line, show_status
+from twin.transport.endpoint import check_endpoint
+from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view
+
+
+def run_test(
+    profile: Path,
+    out: Path | None,
+    unpaced: bool,
+    model: str | None,
+    table: str | None,
+    view: bool,
+    listen: str,
+    keys: Credentials | None = None,
+    router: str = "",
+    remote_twin: bool = False,
+    web: str | None = None,
+) -> int:
+    """Run a test on the table, in real time or at full speed; return the exit code.
+
+    `web` is the address of its page, "" for the default and None for no page.
+    """
+    with show_status("checking the test"):
+        config = read_run_config(profile, table, model)
+    if unpaced:
+        check_full_speed(config.rig, has_page=web is not None)
+    else:
+        check_endpoint(config.rig.name, listen, has_keys=keys is not None)
+        check_realtime(config, profile)
+    compile_kernels(config, table=True)
+    require_disk_space([config], out or RUNS_FOLDER)
+    folder, run_id = make_run_folder(out, config.name)
+    messages = (
+        *list_drive_warnings(config.margins, config.rig),
+        *list_setup_warnings(config.profile, config.rig),
+        *list_model_warnings(config.model_toml),
+    )
+    for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
+        print_line(f"warning: {sentence}")
+    print_line(
+        f"{config.profile.title}: {config.extent}, "
+        f"{config.expected_s:.0f} s on {config.rig.title} "
+        f"-> {folder}"
+    )
+    with nullcontext() if web is None else start_page(web, listen, keys, config.rig.name):
+        with catch_interrupts() as poll_interrupt:
+            if unpaced:
+                _run_unpaced(config, run_id, folder, poll_interrupt)
+            else:
+                connection = (listen, keys, router, remote_twin)
+                began = _run_live(config, run_id, folder, poll_interrupt, view, *connection)
+                if not began:
+                    return EXIT_INTERRUPTED
+        code = finalize_run(folder, config, view)
+    return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
+
+
+def list_model_warnings(model_toml: str) -> list[str]:
+    """Return a warning for a model that its fit marked as provisional."""
+    model = parse_toml(model_toml, ModelConfig, "model")
+    return [f"the model is provisional: {model.provisional}"] if model.provisional else []
+
+
+def _run_unpaced(
+    config: RunConfig, run: str, folder: Path, poll_interrupt: Callable[[], str | None]
+) -> None:
+    from twin.setup.unpaced import play_unpaced
+
+    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
+        play_unpaced(config, run, folder / "run.mcap", poll_interrupt, progress)
+
+
+def _run_live(
+    config: RunConfig,
+    run: str,
+    folder: Path,
+    poll_interrupt: Callable[[], str | None],
+    view: bool,
+    listen: str,
+    keys: Credentials | None,
+    router: str,
+    remote_twin: bool,
+) -> bool:
+    """Run a test in real time; return False if it was interrupted before it began."""
+    from twin.live.process_config import ProcessConfig
+    from twin.live.supervisor import Supervisor
+    from twin.recording.merge_parts import merge_run_parts
+
+    process_config = ProcessConfig(
+        run,
+        config.name,
+        str(folder),
+        listen,
+        config.profile_toml,
+        config.rig_toml,
+        config.model_toml,
+        serve_view=find_free_address(VIEW_ADDRESS) if view else "",
+        keys=credentials_folder(keys),
+        router=router,
+        remote_twin=remote_twin,
+    )
+    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
+        supervisor = Supervisor(
+            process_config,
+            config.profile.on_death,
+            RealClock(),
+            progress,
+            poll_interrupt,
+            progress.print_line,
+        )
+        if view:
+            progress.print_line(format_live_view(process_config.serve_view))
+        began = supervisor.run()
+    if began:
+        merge_run_parts(folder)
+    return began

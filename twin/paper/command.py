@@ -1,0 +1,74 @@
+"""`shaketwin paper`: compare a model, and optionally a measured campaign, with the paper."""
+
+from pathlib import Path
+
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from twin.paper.page import (
+    PAPER_MODEL,
+    ModelSource,
+    draw_paper_figures,
+    write_paper_json,
+    write_paper_page,
+)
+from twin.paper.study import JOB_COUNT, PaperStudy, run_paper_study
+from twin.paper.table import DEPARTS, make_comparison_table
+from twin.results.measured_campaign import MeasuredCampaign, load_measured_campaign
+from twin.results.paper_cases import load_paper_cases
+from twin.setup.folders import make_output_folder
+from twin.setup.run_config import make_run_id, read_model
+from twin.setup.warm_up import COMPILING_MESSAGE
+from twin.system.terminal import announce_if_slow, console, print_line
+
+
+def compare_with_paper(out: Path | None, campaign_paths: list[Path], model: str | None) -> None:
+    """Run the paper study and write its results into a new folder."""
+    campaign = load_measured_campaign(campaign_paths) if campaign_paths else None
+    config, toml_text = read_model(model or PAPER_MODEL, option="--model")
+    source = ModelSource(model or PAPER_MODEL, config, toml_text)
+    with announce_if_slow(COMPILING_MESSAGE):
+        load_paper_cases(model)["G4"].simulator.bumper_preload()
+    write_comparison(make_output_folder(out, make_run_id("paper")), campaign, source)
+
+
+def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: ModelSource) -> None:
+    """Write figures/*.png, report.html and paper.json into an existing folder."""
+    print_line(
+        f"model {source.name}, {source.config.title}: every test of the paper, forward and backward"
+    )
+    study = _run_with_progress(source, campaign)
+    rows = make_comparison_table(study)
+    figure_sets = [("The model", draw_paper_figures(study, None, folder / "figures", print_line))]
+    if campaign is not None:
+        gaps = ", ".join(campaign.runs)
+        figure_sets.append(
+            (
+                f"The rig: {gaps}",
+                draw_paper_figures(study, campaign, folder / "figures", print_line),
+            )
+        )
+    images = [picture for _, pictures in figure_sets for picture in pictures]
+    write_paper_json(rows, study, source, images, folder / "paper.json")
+    write_paper_page(rows, study, source, figure_sets, folder / "report.html")
+    for row in rows:
+        print_line(f"{row.case}: paper: {row.paper}; {source.name}: {row.model}")
+        style = "[bold red]" if row.verdict == DEPARTS else ""
+        console.print(f"    {style}{row.verdict}", highlight=False)
+    departures = sum(row.verdict == DEPARTS for row in rows)
+    print_line(
+        f"{source.name}: {len(rows)} statements, {departures} depart -> {folder / 'report.html'}"
+    )
+
+
+def _run_with_progress(source: ModelSource, campaign: MeasuredCampaign | None) -> PaperStudy:
+    """Run the study with a progress bar on a terminal (about 1 min for an integrated model)."""
+    progress = Progress(
+        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40),
+        TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn(),
+        console=console, disable=not console.is_terminal, transient=True,
+    )  # fmt: skip
+    with progress:
+        task = progress.add_task("sweeps", total=JOB_COUNT)
+        return run_paper_study(
+            source.reference, campaign.scale if campaign else None, lambda: progress.advance(task)
+        )

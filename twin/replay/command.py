@@ -1,0 +1,229 @@
+"""`replay`: rerun the twin on recordings; one with a report, or several in a table."""
+
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+
+from table_io.block import Block
+from table_io.clock import RealClock
+from table_io.errors import InputError
+from table_io.records import Comparison
+from twin.live.replay_publishing import open_publisher
+from twin.recording.reader import Recording, iter_valid_items
+from twin.recording.run_paths import resolve_log_path
+from twin.recording.tabular import parse_step_range
+from twin.replay.pipeline_replay import (
+    RecordedRun,
+    ReplayComparison,
+    SampleRange,
+    compute_deviation,
+    describe_deviation,
+    replay_recording,
+)
+from twin.report.finalize import EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, finalize_run
+from twin.results import summary as summaries
+from twin.results.recordings import read_recorded_config, warn_if_damaged
+from twin.results.rerun import DRIVE_CHANNEL
+from twin.security.credentials import Credentials
+from twin.setup.folders import make_run_folder
+from twin.setup.run_config import RunConfig
+from twin.setup.warm_up import compile_kernels
+from twin.system.progress import RunProgress
+from twin.system.terminal import console, print_line
+from twin.system.versions import find_version_changes, format_version_changes
+from twin.transport.codec import Item
+from twin.transport.endpoint import CMP_TOPIC
+
+RECORDED = "recorded"  # model name: the model stored in the log
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRequest:
+    """Options of the command; `publish` is an endpoint, `steps` a text for `parse_step_range`."""
+
+    logs: list[Path]
+    models: list[str]
+    out: Path | None = None
+    speed: str = "max"
+    view: bool = False
+    publish: str | None = None
+    steps: str | None = None
+    keys: Credentials | None = None
+
+
+def replay_logs(request: ReplayRequest) -> int:
+    """Replay one or several logs; return the exit code."""
+    parse_speed(request.speed)
+    if request.steps is not None:
+        parse_step_range(request.steps)
+    is_single = len(request.logs) * max(len(request.models), 1) == 1
+    if not is_single and (request.view or request.publish):
+        raise InputError(
+            "shows one replay",
+            where="--view" if request.view else "--publish",
+            remedy="give one log and one model",
+        )
+    from twin.replay.table_command import replay_all
+
+    try:
+        return _replay_one(request) if is_single else replay_all(request)
+    except KeyboardInterrupt:
+        print_line("interrupted; what was replayed until then is kept")
+        return EXIT_INTERRUPTED
+
+
+def open_replay_log(log: Path) -> RecordedRun:
+    """Open a log for replay; InputError if it lacks the channel that drives the twin."""
+    recorded = RecordedRun.open(resolve_log_path(log))
+    warn_if_damaged(recorded.recording)
+    require_drive_channel(recorded.recording)
+    return recorded
+
+
+def require_drive_channel(recording: Recording) -> None:
+    """Raise InputError if a recording lacks the channel that drives the twin."""
+    channels = recording.start.channels
+    if DRIVE_CHANNEL not in channels:
+        raise InputError(
+            f"not recorded, but it drives the twin; there: {', '.join(channels)}",
+            where=recording.path,
+            key=DRIVE_CHANNEL,
+            remedy="import the table's acceleration too",
+        )
+
+
+def load_replay_config(recording: Recording, model: str | None) -> RunConfig:
+    """Return the `RunConfig` of a recording, with `model` in place of the recorded one if given."""
+    config = read_recorded_config(recording, None if model in (None, RECORDED) else model)
+    compile_kernels(config)
+    return config
+
+
+def select_span(recording: Recording, steps: str | None) -> SampleRange:
+    """Return the samples of the selected steps, all if `steps` is None."""
+    if steps is None:
+        return SampleRange.all_samples(recording)
+    return SampleRange.of_steps(recording, *parse_step_range(steps))
+
+
+def _replay_one(request: ReplayRequest) -> int:
+    recorded = open_replay_log(request.logs[0])
+    model = request.models[0] if request.models else None
+    recording = recorded.recording
+    config, span = load_replay_config(recording, model), select_span(recording, request.steps)
+    speed, rate_hz = parse_speed(request.speed), recorded.start.rate_hz
+    is_observed = speed is not None or request.publish is not None
+    block_samples = recorded.start.block_samples if is_observed else 0
+    publishing = (
+        open_publisher(config, request.publish, request.keys) if request.publish else nullcontext()
+    )
+    clock = RealClock()
+    samples = min(config.drive.planned_end, span.last)
+    with publishing as publisher, RunProgress(console, len(config.steps), samples) as progress:
+        folder, run = make_run_folder(request.out, f"{config.name}-replay")
+        if publisher is not None:
+            publisher.start(run, at_once=speed is not None)
+        began_s = clock.now()
+
+        def on_item(item: Item) -> None:
+            if speed is not None:
+                offset = (item.end if isinstance(item, Block) else item.index) - span.first
+                clock.wait_until(began_s + offset / rate_hz / speed)
+            if publisher is not None:
+                publisher.publish(item)
+            progress(item)
+
+        identity = replay_recording(
+            recorded, config, folder / "run.mcap", run, on_item, span, block_samples
+        )
+    comparison = describe_replay(recorded, config, model, identity, folder / "run.mcap")
+    code = finalize_run(folder, config, request.view, {"replay": comparison})
+    print_line(format_identity(identity, comparison))
+    same = config.model_toml == recorded.start.model_toml
+    return EXIT_NOT_IDENTICAL if same and identity.differs else code
+
+
+def describe_replay(
+    recorded: RecordedRun,
+    config: RunConfig,
+    model: str | None,
+    identity: ReplayComparison,
+    log: Path,
+) -> summaries.Json:
+    """Compare a replay with its recording; return the entry `replay` of its summary.json."""
+    recording = recorded.recording
+    same = config.model_toml == recording.start.model_toml
+    payloads = [payload for _, payload in sorted(recorded.comparisons.items())]
+    recorded_items = [*iter_valid_items(CMP_TOPIC, payloads, recording.start, [])]
+    return {
+        "of": str(recording.path),
+        "run": recording.run,
+        "model": RECORDED if same else model,
+        "identical": identity.is_identical,
+        "beginning": identity.beginning or None,
+        "comparisons": identity.recorded,
+        "compared": identity.compared,
+        "differing": identity.differing,
+        "missing": identity.missing,
+        "unrecorded": identity.unrecorded,
+        "lost_with_twin": identity.lost_with_twin,
+        "hashes": identity.hashes,
+        "hashes_compared": identity.hashes_compared,
+        "hashes_differing": identity.hashes_differing,
+        "predictions_compared": identity.predictions_compared,
+        "predictions_differing": identity.predictions_differing,
+        "first_difference_index": identity.first_difference,
+        "largest_difference_of_error_sums": identity.largest,
+        "relative_difference": compute_deviation(recording.path, log) if identity.differs else {},
+        "versions_differing": find_version_changes(recording.start.versions),
+        "recorded_comparison": summaries.channel_nrmse(
+            tuple(item for item in recorded_items if isinstance(item, Comparison)),
+            config.parameters,
+            config.rig.channel_by_name,
+            summaries.find_channel_noise(recording),
+        ),
+    }
+
+
+def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> str:
+    """Format in one line whether a replay is identical, or the differences and their cause."""
+    if identity.is_identical:
+        lost = identity.lost_with_twin
+        suffix = f"; {lost} more died with the twin before they were recorded" if lost else ""
+        hashes = f" and {identity.hashes} hashes of predictions" if identity.hashes else ""
+        return f"{identity.compared} comparisons{hashes}, identical to the bit{suffix}"
+    if not identity.recorded:
+        return f"no comparisons were recorded; {identity.made} are made"
+    parts = [f"its beginning is in {identity.beginning}"] if identity.beginning else []
+    parts += [
+        f"{identity.differing} of {identity.recorded} comparisons differ, "
+        f"{identity.missing} missing, {identity.unrecorded} never recorded"
+    ]
+    if identity.hashes_differing or identity.hashes_compared < identity.hashes:
+        parts.append(
+            f"of {identity.hashes} hashes of predictions {identity.hashes_differing} differ, "
+            f"{identity.hashes - identity.hashes_compared} missing"
+        )
+    if comparison["relative_difference"]:
+        parts.append(describe_deviation(comparison["relative_difference"]))
+    if comparison["model"] == RECORDED:
+        version_changes = format_version_changes(comparison["versions_differing"])
+        parts.append(f"versions: {version_changes or 'all that were recorded are the same'}")
+    return "; ".join([*parts, "see summary.json, replay"])
+
+
+def parse_speed(speed: str) -> float | None:
+    """Parse a speed as a multiple of real time; None for max."""
+    if speed == "max":
+        return None
+    try:
+        multiple = float(speed)
+    except ValueError:
+        multiple = 0.0
+    if not 0 < multiple < 1e6:
+        raise InputError(
+            "not a speed",
+            where=f"--speed {speed}",
+            allowed="max, or a number above 0 (times real time)",
+        )
+    return multiple

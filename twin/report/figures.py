@@ -1,0 +1,377 @@
+"""Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12."""
+
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from table_io.block import Block
+from table_io.records import Level, PrcPoint
+from table_io.units import GRAVITY_M_S2
+from twin.compare.curves import Hysteresis
+from twin.drawing.branch_curves import FREE_QUANTITIES
+from twin.drawing.branch_figures import branch_handles, plot_branches
+from twin.drawing.model_branches import follow_model_branches
+from twin.drawing.motion_drawing import draw_rest_lines
+from twin.drawing.orbit_figure import draw_orbits
+from twin.drawing.plot_style import (
+    DIRECTION_COLOURS,
+    FIGURE_WIDTH_IN,
+    GUIDE_COLOUR,
+    HYSTERESIS_COLOURS,
+    PRECOMPRESSION_COLOUR,
+    TWIN_COLOUR,
+    CaptionedFigure,
+    CaptionedFigures,
+    LineStyle,
+    Picture,
+    measured_style,
+    save_figures,
+    twin_style,
+)
+from twin.drawing.prc_drawing import (
+    FREE_PANELS,
+    PRC_PANELS,
+    break_at_jumps,
+    draw_jumps,
+    format_mirrored_axis,
+    make_prc_panels,
+    plot_prc,
+    shade_hysteresis,
+    shade_precompression,
+)
+from twin.drawing.step_figures import draw_histories, draw_legend, draw_loop_figures
+from twin.drawing.table_motion_figures import draw_table_motion
+from twin.drawing.window_figure import draw_window_histories
+from twin.results.report_data import (
+    DIRECTIONS,
+    IMPACT_KEYS,
+    ReportData,
+    compute_envelopes,
+    compute_prestress,
+    compute_step_errors,
+    extract_prc,
+)
+from twin.results.summary import parse_jumps
+
+MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
+
+
+def draw_run_figures(
+    run: ReportData, folder: Path, more_formats: Sequence[str] = ()
+) -> list[Picture]:
+    """Draw all figures for which the run has data into PNG files; return them in report order.
+
+    `more_formats`: see `save_figures`.
+    """
+    for stale in folder.glob("histories_*hz.*"):
+        stale.unlink()
+    # No exponent above an axis is in the way of a title: searching its place takes a tenth of all.
+    with mpl.rc_context({"axes.titley": 1.0}):
+        return save_figures(draw_figures(run), folder, more_formats=more_formats)
+
+
+def draw_figures(run: ReportData) -> CaptionedFigures:
+    """Yield all figures for which the run has data, in report order."""
+    for draw in (
+        draw_orbits,
+        _draw_prc,
+        _draw_model_branches,
+        _draw_impacts,
+        draw_histories,
+        draw_window_histories,
+        draw_loop_figures,
+        _draw_errors,
+        _draw_overview,
+        _draw_level,
+        draw_table_motion,
+    ):
+        yield from draw(run)
+
+
+def _draw_prc(run: ReportData) -> CaptionedFigures:
+    """Draw the pseudo-resonance curves (Figs. 2 and 11)."""
+    measured, twin = (partial(extract_prc, run.points, source) for source in ("measured", "twin"))
+    curves = measured if run.source == "measured" else twin
+    if not any(np.isfinite(curves(direction, "eta_d")[1]).any() for direction in DIRECTIONS):
+        return
+    contents = PRC_PANELS if run.has_bumpers else FREE_PANELS
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
+    axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
+    panels = make_prc_panels(axes, contents)
+    intervals = [Hysteresis(**interval) for interval in run.summary.get("hysteresis") or []]
+    prestress = compute_prestress(run)
+    shade_hysteresis(panels, intervals)
+    shade_precompression(panels, prestress)
+    jumps, twin_jumps = (parse_jumps(run.summary, source) for source in ("measured", "twin"))
+    measured_jumps = jumps if run.source == "measured" else []
+    plot_prc(panels, break_at_jumps(measured, measured_jumps), _dotted_style)
+    plot_prc(panels, break_at_jumps(twin, twin_jumps), twin_style)
+    draw_jumps(panels, curves, jumps, label_in="eta_d")
+    kinds = sorted({interval.kind for interval in intervals})
+    patches = [Patch(color=HYSTERESIS_COLOURS[kind], label=f"{kind} hysteresis") for kind in kinds]
+    if prestress:
+        patches.append(
+            Patch(
+                fc=PRECOMPRESSION_COLOUR, ec=GUIDE_COLOUR, ls="--", lw=0.8, label="precompression"
+            )
+        )
+    draw_legend(run, figure, *patches, marker="o")
+    caption = (
+        "One point per frequency step, averaged over its measured cycles; measured wide and pale, "
+        "twin thin. Curves are broken where they jump; arrows: jumps between two grid frequencies. "
+        "Displacement and deformation are divided by the free-flight maximum "
+        "u*, acceleration by a*, forces by the weight."
+    )
+    if prestress:
+        caption += " Grey: deformation and force of a precompressed bumper at rest, from the model."
+    yield CaptionedFigure("prc", "Pseudo-resonance curves", caption, figure)
+
+
+def _draw_model_branches(run: ReportData) -> CaptionedFigures:
+    """Draw the points over the model's branches, stable and unstable, between the jumps."""
+    branches = follow_model_branches(run)
+    if not branches:
+        return
+    scales = {"eta_d": run.summary["u_star_m"], "eta_a": run.summary["a_star_m_s2"]}
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
+    axes = figure.subplots(1, 2, sharex=True, squeeze=False)
+    panels = make_prc_panels(axes, FREE_PANELS)
+    for (ax, quantities), quantity in zip(panels, FREE_QUANTITIES, strict=True):
+        (name,) = quantities
+        label = ax.get_ylabel()
+        plot_branches(ax, branches, quantity, scale=quantity.si / scales[name])
+        ax.set_ylabel(label)
+        for direction in DIRECTIONS:
+            f, y = extract_prc(run.points, run.source, direction, name)
+            style = {**_dotted_style(direction), "ls": ""}
+            ax.plot(f, y, zorder=1.5, label=f"{run.source} {direction}", **style)
+    handles = [*axes[0, 0].get_legend_handles_labels()[0], *branch_handles(branches)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=7)
+    yield CaptionedFigure(
+        "model_branches",
+        "Branches of the model",
+        "Periodic motions of the model at the nominal level: solid stable, dashed unstable. The "
+        "sweep can follow a stable motion up to a fold, where it must jump. An unstable motion "
+        "separates the starts that lead to the one and to the other stable motion.",
+        figure,
+    )
+
+
+def _dotted_style(direction: str) -> LineStyle:
+    return {**measured_style(direction), "marker": "o", "ms": MARKER_SIZES[direction]}
+
+
+def _draw_impacts(run: ReportData) -> CaptionedFigures:
+    """Draw the impacts per forcing cycle of both sides, one row per direction."""
+    directions = [
+        direction
+        for direction in DIRECTIONS
+        if extract_prc(run.points, run.source, direction, IMPACT_KEYS[0])[0].size
+    ]
+    counts = [
+        extract_prc(run.points, run.source, direction, side)[1]
+        for direction in directions
+        for side in IMPACT_KEYS
+    ]
+    if not run.has_bumpers or not any(np.isfinite(count).any() for count in counts):
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.3 * len(directions) + 0.4))
+    rows = figure.subplots(len(directions), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for ax, direction in zip(rows, directions, strict=True):
+        for side, sign in zip(IMPACT_KEYS, (1, -1), strict=True):
+            f, y = extract_prc(run.points, "measured", direction, side)
+            ax.vlines(f, 0, sign * y, color=DIRECTION_COLOURS[direction], lw=3, alpha=0.35)
+            ax.plot(f, sign * y, "o", color=DIRECTION_COLOURS[direction])
+            f, y = extract_prc(run.points, "twin", direction, side)
+            ax.plot(f, sign * y, "o", ms=6.5, mfc="none", mec=TWIN_COLOUR, mew=0.8)
+        ax.set_ylabel("impacts per cycle")
+        ax.set_title(direction)
+        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
+        format_mirrored_axis(ax)
+    rows[-1].set_xlabel("frequency in Hz")
+    handles = [
+        Line2D([], [], color=TWIN_COLOUR, marker="o", ms=6.5, mfc="none", ls="", label="twin")
+    ]
+    if run.source == "measured":
+        handles += [
+            Line2D(
+                [],
+                [],
+                color=DIRECTION_COLOURS[direction],
+                marker="o",
+                label=f"measured {direction}",
+            )
+            for direction in directions
+        ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+    caption = (
+        "Mean over the measured cycles of a step; a fractional value means that the count varies "
+        "from cycle to cycle."
+    )
+    yield CaptionedFigure("impacts", "Impacts per forcing cycle", caption, figure)
+
+
+def _draw_errors(run: ReportData) -> CaptionedFigures:
+    """Draw the NRMSE of the free-running and the restarted twin over frequency."""
+    errors = {
+        part: step_nrmse
+        for part, step_nrmse in compute_step_errors(run).items()
+        if np.isfinite(list(step_nrmse.values())).any()
+    }
+    if not errors or run.windows:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * ((len(errors) + 1) // 2) + 0.4))
+    axes = figure.subplots((len(errors) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False)
+    for ax, (part, step_nrmse) in zip(axes.flat, errors.items(), strict=False):
+        for direction in DIRECTIONS:
+            steps = [
+                step
+                for step in run.steps
+                if step["direction"] == direction and step["index"] in step_nrmse
+            ]
+            f = [step["frequency_hz"] for step in steps]
+            nrmse = np.array([step_nrmse[step["index"]] for step in steps]).reshape(-1, 2)
+            ax.semilogy(f, nrmse[:, 0], "o-", color=DIRECTION_COLOURS[direction], lw=0.9)
+            ax.semilogy(
+                f, nrmse[:, 1], "o:", color=DIRECTION_COLOURS[direction], lw=0.9, mfc="white"
+            )
+        ax.set_title(f"${part}$")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("NRMSE")
+    for ax in axes[-1]:
+        ax.set_xlabel("frequency in Hz")
+    handles = [
+        Line2D(
+            [],
+            [],
+            color=DIRECTION_COLOURS[direction],
+            marker="o",
+            ls=ls,
+            mfc=face,
+            label=f"{twin_kind}, {direction}",
+        )
+        for direction in DIRECTIONS
+        for twin_kind, ls, face in (
+            ("free-running", "-", DIRECTION_COLOURS[direction]),
+            ("restarted", ":", "white"),
+        )
+    ]
+    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    caption = (
+        "NRMSE: RMS error divided by RMS measurement over the measured cycles of each step; a "
+        "constant zero would give 1. The restarted twin starts every window from the measured "
+        "state. Contact forces only with contact."
+    )
+    yield CaptionedFigure("comparison", "Error of the twin", caption, figure)
+
+
+def _draw_overview(run: ReportData) -> CaptionedFigures:
+    """Draw envelopes of table and mass motion over the whole run, with the steps shaded."""
+    blocks, rows = compute_envelopes(run)
+    if not rows:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 1.7 * len(rows) + 0.4))
+    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    peaks = {step.acceleration_m_s2 for step in run.recording.start.steps}
+    for ax, (label, envelopes) in zip(axes, rows.items(), strict=True):
+        for time, low, high in envelopes:
+            ax.fill_between(time, low, high, color="#8b929c", lw=0)
+        ax.set_ylabel(label)
+        _shade_steps(run, ax, blocks, ax is axes[0])
+        if label.startswith("$u$") and run.gaps_m is not None:
+            draw_rest_lines(run.gaps_m, ax.axhline)
+        for peak in peaks if label == "table in m/s²" else ():
+            ax.axhline(peak, color="#111111", ls="--", lw=0.9)
+            ax.axhline(-peak, color="#111111", ls="--", lw=0.9)
+    axes[-1].set_xlabel("time in s")
+    axes[-1].set_xlim(blocks[0].time_s[0], blocks[-1].time_s[-1])
+    caption = (
+        "Envelopes. Shading: steps, red forward, blue backward, with their frequencies in Hz on "
+        "top. Dashed: demanded peak acceleration and positions of the bumpers at rest."
+    )
+    yield CaptionedFigure("overview", "Drive and response over the run", caption, figure)
+
+
+def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labels: bool) -> None:
+    visits = run.summary.get("visits") or []
+    steps_by_index = {step["index"]: step for step in (*run.steps, *visits)}
+    duration_s = blocks[-1].time_s[-1] - blocks[0].time_s[0]
+    next_label_s = 0.0
+    for block in blocks:
+        cuts = np.flatnonzero(np.diff(block.step)) + 1
+        for first, last in zip([0, *cuts], [*cuts, len(block)], strict=True):
+            step = steps_by_index.get(int(block.step[first]))
+            if step is None:
+                continue
+            start, stop = block.time_s[first], block.time_s[last - 1]
+            shade = 0.20 if step["index"] % 2 else 0.09
+            ax.axvspan(
+                start, stop, color=DIRECTION_COLOURS[step["direction"]], alpha=shade, lw=0, zorder=0
+            )
+            if show_labels and start >= next_label_s:
+                middle = (start + stop) / 2
+                ax.annotate(
+                    f"{step['frequency_hz']:g}", (middle, 1.02), xycoords=("data", "axes fraction"),
+                    ha="center", size=8, color=GUIDE_COLOUR,
+                )  # fmt: skip
+                next_label_s = start + duration_s / 22
+
+
+def _draw_level(run: ReportData) -> CaptionedFigures:
+    """Draw the level error of the measured cycles, the error without control, and the correction.
+
+    The uncorrected level is the measured level divided by the correction.
+    """
+    accepted = {level.step: level for level in run.recording.records(Level) if level.accepted}
+    points = [point for point in run.recording.records(PrcPoint) if point.step in accepted]
+    if not points:
+        return
+    demand = accepted[points[0].step].demanded_m_s2
+    figure = Figure(figsize=(9.5, 4.6))
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    for direction in DIRECTIONS:
+        direction_points = [point for point in points if point.direction == direction]
+        if not direction_points:
+            continue
+        f = np.array([point.frequency_hz for point in direction_points])
+        reached = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
+        demanded = np.array([accepted[point.step].demanded_m_s2 for point in direction_points])
+        correction = np.array([accepted[point.step].correction for point in direction_points])
+        order = np.argsort(f)
+        colour = DIRECTION_COLOURS[direction]
+        error, uncorrected_error = (
+            100 * (reached / demanded - 1),
+            100 * (reached / correction / demanded - 1),
+        )
+        upper.plot(f[order], error[order], "o-", color=colour, ms=3, label=f"{direction}")
+        upper.plot(
+            f[order],
+            uncorrected_error[order],
+            ":",
+            color=colour,
+            lw=1.2,
+            label=f"{direction}, uncorrected",
+        )
+        lower.plot(f[order], correction[order], "o-", color=colour, ms=3)
+    for tolerance_percent in (-2, 2):
+        upper.axhline(tolerance_percent, color="#777777", lw=0.8, ls="--")
+    upper.set_ylabel("level error in %")
+    upper.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    lower.set_ylabel("correction")
+    lower.set_xlabel("frequency in Hz")
+    yield CaptionedFigure(
+        "level",
+        "Level of the table",
+        f"Error of the fundamental of the measured table acceleration relative to the demanded "
+        f"{demand / GRAVITY_M_S2:.3g} g over the measured cycles of each step (dashed: ±2 %), the "
+        "same without correction of the command (dotted), and the correction factor.",
+        figure,
+    )

@@ -1,0 +1,50 @@
+"""Finalization of a run: summary, report, optional view file, and exit code."""
+
+from pathlib import Path
+
+from rich.markup import escape
+
+from twin.recording.reader import read_recording
+from twin.results import summary as summaries
+from twin.results.rerun import restore_predictions
+from twin.results.twin_verdict import NOTHING_MEASURED, format_twin_verdict
+from twin.setup.run_config import RunConfig
+from twin.system.terminal import console, print_line
+
+VERDICT_COLOURS = {"agrees": "green", "departs": "red", "not judged": "yellow"}
+EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
+
+
+def finalize_run(
+    folder: Path, run_config: RunConfig, view: bool = False, extra: summaries.Json | None = None
+) -> int:
+    """Write summary, report and optional view, print a one-line summary; return the exit code."""
+    from twin.report.report import write_report
+
+    recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
+    summary = summaries.summarise(recording, run_config.parameters)
+    summary |= extra or {}
+    summaries.write_summary(summary, folder / "summary.json")
+    write_report(folder, recording)
+    if view:
+        from twin.viewer.view import write_rrd
+
+        write_rrd(recording, folder / "view.rrd")
+    message = f"test {summaries.format_summary(summary)} -> {folder / 'report.html'}"
+    print_line(message)
+    print_twin_verdict(summary, folder)
+    if summary["verdict"] != "complete":
+        return EXIT_ABORTED
+    return EXIT_GAPS if summary["gaps"] else 0
+
+
+def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
+    """Print the verdict on the twin and the next command, coloured; nothing without a twin."""
+    verdict = summary["twin_verdict"]
+    if verdict["reason"] == NOTHING_MEASURED:
+        return
+    colour = VERDICT_COLOURS[verdict["verdict"]]
+    first, *lines = format_twin_verdict(verdict, folder)
+    console.print(f"[bold {colour}]{escape(first)}[/]", highlight=False, soft_wrap=True)
+    for line in lines:
+        print_line(f"  {line}")

@@ -1,0 +1,201 @@
+"""HTML report of a run: one self-contained file.
+
+Values from the summary are shown unchanged; the page loads nothing from outside.
+"""
+
+from collections.abc import Sequence
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.messages import format_kind
+from table_io.records import (
+    Agreement,
+    Check,
+    Event,
+    Fault,
+    FrequencyResponse,
+    Level,
+    Params,
+    SampleGap,
+    Timing,
+    Trip,
+)
+from twin.compare.pipeline import EVENT_KINDS
+from twin.drawing.page import embed_images, format_significant, render_page
+from twin.drawing.plot_style import Picture
+from twin.drawing.table_motion_figures import MOTION_FIGURES
+from twin.recording.reader import Recording, read_recording
+from twin.report.figures import draw_run_figures
+from twin.results.contracts import SummaryKeys
+from twin.results.report_data import (
+    ReportData,
+    build_report_data,
+    step_quantity,
+)
+from twin.results.sensor_table import build_sensor_rows
+from twin.results.summary import load_summary, parse_toml_tables
+from twin.results.table_motion import format_required, format_tracking
+from twin.results.twin_verdict import NOTHING_MEASURED, describe_worst, format_jump, name_command
+
+MAX_ROWS = 200
+MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
+
+
+def write_report(
+    folder: Path, recording: Recording | None = None, more_formats: Sequence[str] = ()
+) -> Path:
+    """Write folder/report.html and its figures from run.mcap and summary.json; return the path.
+
+    A `recording` already in memory is not read again. `more_formats` of the figures: see
+    `save_figures`.
+    """
+    run = load_report_data(folder, recording)
+    path = folder / "report.html"
+    pictures = draw_run_figures(run, folder / "figures", more_formats)
+    path.write_text(render_report(run, pictures), encoding="utf-8")
+    return path
+
+
+def load_report_data(folder: Path, recording: Recording | None = None) -> ReportData:
+    """Return the report data of a run's folder, from run.mcap and summary.json."""
+    remedy = "give a folder written by run, replay or simulate"
+    summary = load_summary(folder / "summary.json", SummaryKeys, remedy)
+    return build_report_data(recording or read_recording(folder / "run.mcap"), summary)
+
+
+def render_report(run: ReportData, pictures: list[Picture]) -> str:
+    """Render the report page as HTML text with every figure embedded."""
+    start, recording = run.recording.start, run.recording
+    texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
+    motion_pictures = [picture for picture in pictures if picture.path.stem in MOTION_FIGURES]
+    other_pictures = [picture for picture in pictures if picture not in motion_pictures]
+    return render_page(
+        Path(__file__).with_name("report.html"),
+        run=run,
+        summary=run.summary,
+        start=start,
+        headline=format_headline(run),
+        **_describe_twin_verdict(run),
+        configs={name: parse_toml_tables(text) for name, text in texts.items()},
+        images=embed_images(other_pictures),
+        motion_images=embed_images(motion_pictures),
+        format_required=format_required,
+        demand={step.index: step.acceleration_m_s2 for step in start.steps},
+        texts=[
+            (name, sha256(text.encode()).hexdigest(), _shorten(text))
+            for name, text in texts.items()
+        ],
+        timings={timing.component: timing for timing in recording.records(Timing)},
+        gaps=recording.records(SampleGap),
+        faults=recording.records(Fault),
+        events=[
+            event for event in recording.records(Event) if event.kind not in ("state", *EVENT_KINDS)
+        ],
+        monitor_events=[event for event in recording.records(Event) if event.kind in EVENT_KINDS],
+        format_kind=format_kind,
+        compared=any(
+            np.isfinite(agreement.error).any() for agreement in recording.records(Agreement)
+        ),
+        sensors=build_sensor_rows(start),
+        states=recording.stop.states if recording.stop else (),
+        checks=recording.records(Check),
+        trips=recording.records(Trip),
+        response=next(iter(recording.records(FrequencyResponse)), None),
+        level=worst_level(run),
+        parameters=recording.records(Params),
+        max_rows=MAX_ROWS,
+        quantity=step_quantity,
+    )
+
+
+def _describe_twin_verdict(run: ReportData) -> dict[str, Any]:
+    """Return the values of the page for the verdict on the twin; None without one."""
+    verdict = run.summary.get("twin_verdict")
+    if verdict is None or verdict["reason"] == NOTHING_MEASURED:
+        return {"twin_verdict": None}
+    return {
+        "twin_verdict": verdict,
+        "worst": describe_worst(verdict["worst"]) if verdict["worst"] else None,
+        "next_command": name_command(verdict, run.recording.path.parent),
+        "format_jump": format_jump,
+    }
+
+
+def _shorten(text: str) -> str:
+    """Return the beginning of a long text: a profile may hold a file of its excitation."""
+    if len(text) <= MAX_TEXT_LENGTH:
+        return text
+    rest = len(text) - MAX_TEXT_LENGTH
+    return f"{text[:MAX_TEXT_LENGTH]}\n... {rest} more characters, see the recording"
+
+
+def worst_level(run: ReportData) -> dict[str, float] | None:
+    """Return the largest level errors (relative) with and without control, and most updates.
+
+    None if no step has level records.
+    """
+    levels = [step["level"] for step in run.steps if step.get("level")]
+    if not levels:
+        return None
+    return {
+        "controlled": max(abs(level["error"]) for level in levels),
+        "uncontrolled": max(abs(level["error_uncorrected"]) for level in levels),
+        "updates": max(record.update for record in run.recording.records(Level)),
+        "steps": len(levels),
+    }
+
+
+def format_orbit_headline(
+    orbits: list[dict[str, Any]], is_backbone: bool, folds: Sequence[dict[str, Any]] = ()
+) -> str:
+    """Format the headline of a continuation: orbits accepted, range, feedback and folds."""
+    accepted = [orbit for orbit in orbits if orbit["accepted"]]
+    if not accepted:
+        return f"{len(orbits)} orbits, none accepted."
+    unstable = [orbit for orbit in accepted if not orbit["stable"]] or accepted
+    frequencies = [orbit["frequency_hz"] for orbit in unstable]
+    share = max(orbit["feedback_share"] for orbit in accepted)
+    if is_backbone:
+        return (
+            f"{len(accepted)} of {len(orbits)} points of the backbone measured, "
+            f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
+            f"{100 * share:.2g} % of the command."
+        )
+    turns = [f"; {fold['kind']} fold at {fold['frequency_hz']:.4f} Hz" for fold in folds]
+    return (
+        f"{len(accepted)} of {len(orbits)} orbits measured, {len(unstable)} of them unstable from "
+        f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
+        f"{100 * share:.2g} % of the command{''.join(turns)}."
+    )
+
+
+def format_headline(run: ReportData) -> str:
+    """Format the headline: steps completed, hysteresis, findings and largest excursion."""
+    if run.windows:
+        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        kind = planned.get("kind", "history")
+        headline = f"{len(run.windows)} windows of a displacement history ({kind}), open loop"
+        tracking = run.summary.get("tracking")
+        return f"{headline}; {format_tracking(tracking)}." if tracking else f"{headline}."
+    if run.orbits:
+        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        folds = run.summary.get("folds") or []
+        return format_orbit_headline(run.orbits, planned.get("kind") == "backbone", folds)
+    done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
+    parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
+    parts += [
+        f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
+        for interval in run.summary.get("hysteresis") or []
+    ] or ["no hysteresis"]
+    parts += run.summary.get("found") or []
+    eta_d = np.nan_to_num([step_quantity(step, run.source, "eta_d") for step in run.steps])
+    if eta_d.any():
+        peak_step = run.steps[int(np.argmax(eta_d))]
+        location = f"{peak_step['frequency_hz']:g} Hz {peak_step['direction']}"
+        parts.append(
+            f"largest normalized excursion {format_significant(eta_d.max())} at {location}"
+        )
+    return "; ".join(parts) + "."

@@ -1,0 +1,94 @@
+"""Page of a comparison of two runs: verdicts, curves over each other, jumps, parameters."""
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from twin.drawing.page import embed_images, render_page
+from twin.drawing.plot_style import (
+    DIRECTION_DASHES,
+    FIGURE_WIDTH_IN,
+    CaptionedFigure,
+    CaptionedFigures,
+    LineStyle,
+    save_figures,
+)
+from twin.drawing.prc_drawing import (
+    FREE_PANELS,
+    PRC_PANELS,
+    break_at_jumps,
+    make_prc_panels,
+    plot_prc,
+)
+from twin.report.run_comparison import ComparedRun
+from twin.results.quantities import format_quantity
+from twin.results.report_data import DIRECTIONS, extract_prc
+from twin.results.summary import Json, parse_jumps, prc_points
+from twin.results.twin_verdict import CHANNEL_SYMBOLS
+
+RUN_COLOURS = ("#c8741a", "#0f7b7b")  # first, second: neither is that of a direction
+
+
+def write_comparison_page(
+    folder: Path, first: ComparedRun, second: ComparedRun, comparison: Json
+) -> Path:
+    """Write compare.html and its figures into a folder; return the path of the page."""
+    pictures = save_figures(draw_comparison(first, second), folder / "figures")
+    page = folder / "compare.html"
+    page.write_text(
+        render_page(
+            Path(__file__).with_name("run_comparison.html"),
+            comparison=comparison,
+            images=embed_images(pictures),
+            quantity=format_quantity,
+            symbols=CHANNEL_SYMBOLS,
+        ),
+        encoding="utf-8",
+    )
+    return page
+
+
+def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures:
+    """Draw the curves of two runs over each other: measured wide and pale, twin thin on top."""
+    points = [prc_points(run.summary["steps"]) for run in (first, second)]
+    if not any(points):
+        return
+    has_bumpers = any(
+        np.isfinite(extract_prc(of_run, source, direction, "r_r")[1]).any()
+        for of_run in points
+        for source in ("measured", "twin")
+        for direction in DIRECTIONS
+    )
+    contents = PRC_PANELS if has_bumpers else FREE_PANELS
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
+    axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
+    panels = make_prc_panels(axes, contents)
+    handles = []
+    named_runs = zip((first, second), points, RUN_COLOURS, ("first", "second"), strict=True)
+    for run, of_run, colour, name in named_runs:
+        for source in ("measured", "twin"):
+            jumps = parse_jumps(run.summary, source)
+            curves = break_at_jumps(partial(extract_prc, of_run, source), jumps)
+            plot_prc(panels, curves, partial(_run_style, colour, source))
+            handles.append(
+                Line2D([], [], **_run_style(colour, source, "forward"), label=f"{name}, {source}")
+            )
+    for direction in DIRECTIONS:
+        style = {"color": "#555555", "lw": 1.0, "ls": DIRECTION_DASHES[direction]}
+        handles.append(Line2D([], [], **style, label=direction))
+    figure.legend(handles=handles, loc="outside upper center", ncols=6)
+    caption = (
+        "One point per frequency step. Measured wide and pale, twin thin; solid forward, dashed "
+        "backward; broken where it jumps. Each run is divided by its own u* and a*."
+    )
+    yield CaptionedFigure("prc", "Pseudo-resonance curves of both runs", caption, figure)
+
+
+def _run_style(colour: str, source: str, direction: str) -> LineStyle:
+    shape: LineStyle = (
+        {"lw": 3.0, "alpha": 0.4} if source == "measured" else {"lw": 0.9, "alpha": 1.0}
+    )
+    return {"color": colour, "ls": DIRECTION_DASHES[direction], **shape}

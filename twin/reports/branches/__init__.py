@@ -1,1 +1,0 @@
-"""Report of periodic branches: figures, tables and a page to explore them."""

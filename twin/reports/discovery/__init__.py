@@ -1,1 +1,0 @@
-"""Files of `identify` and `discover`: load recordings, write models, verdicts and reports."""

@@ -1,0 +1,1 @@
+"""What a run showed, worked out once; every page, console line and file shows these values."""

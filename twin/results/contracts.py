@@ -1,0 +1,820 @@
+"""Contracts of summary.json, verdict.json and features.json: each key, its meaning and its unit.
+
+The writers accept nothing else (`twin.results.summary.dump_contract`). A number that is not finite
+is null in a file, as JSON has no NaN.
+"""
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+def _declare_unit(unit: str) -> Any:
+    """Return the annotation that adds a unit to the schema of a number."""
+    return Field(json_schema_extra={"unit": unit})
+
+
+Number = float | None
+Ratio = Annotated[Number, _declare_unit("1")]
+Metres = Annotated[Number, _declare_unit("m")]
+Acceleration = Annotated[Number, _declare_unit("m/s2")]
+Seconds = Annotated[float, _declare_unit("s")]
+Milliseconds = Annotated[Number, _declare_unit("ms")]
+Minutes = Annotated[float, _declare_unit("min")]
+Hertz = Annotated[float, _declare_unit("Hz")]
+Degrees = Annotated[Number, _declare_unit("deg")]
+Index = Annotated[int, _declare_unit("sample")]
+SI = Annotated[Number, _declare_unit("SI unit of the quantity")]
+Direction = Literal["forward", "backward"]
+
+
+class Contract(BaseModel):
+    """Object with exactly these keys; those with a default may be absent."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+def build_json_schema(contract: type[BaseModel]) -> dict[str, Any]:
+    """Build the JSON Schema (draft 2020-12) of a contract."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        **contract.model_json_schema(),
+    }
+
+
+class RunInfo(Contract):
+    """Origin and length of a recording."""
+
+    id: str = Field(description="unique name of the run")
+    name: str = Field(description="name of its profile")
+    title: str = Field(description="title in the profile")
+    source: str = Field(description="origin of the measured samples: table or model")
+    started_at: str = Field(description="local time, ISO 8601")
+    host: str = Field(description="computer that recorded it")
+    rate_hz: Hertz = Field(description="sampling rate")
+    samples: Index = Field(description="length in samples")
+    duration_s: Seconds = Field(description="length in time")
+    normalisation: str = Field(description="how u* and a* are found")
+    gap_m: Metres = Field(
+        None, description="nominal total gap; null without bumpers and in old files"
+    )
+    model: str | None = Field(None, description="title of the twin's model; null in old files")
+    branches_from: str = Field(description="source of `jumps` and `hysteresis`: measured or twin")
+
+
+class Response(Contract):
+    """Normalized response at a step: mean over the measured cycles of the ratio of each cycle.
+
+    Eq. 1 of Stefani et al. takes one largest and one smallest value of the steady motion, which is
+    the same where every cycle is alike and more where they differ.
+    """
+
+    eta_d: Ratio = Field(description="half range of u over u*")
+    eta_a: Ratio = Field(description="half range of the total acceleration of the mass over a*")
+    eta_r: Ratio = Field(description="deformation of the right bumper over u*")
+    eta_l: Ratio = Field(description="deformation of the left bumper over u*")
+    r_r: Ratio = Field(description="force of the right bumper over the weight of the mass")
+    r_l: Ratio = Field(description="force of the left bumper over the weight of the mass")
+    impacts_right: list[int] = Field(description="impacts on the right bumper in each cycle")
+    impacts_left: list[int] = Field(description="impacts on the left bumper in each cycle")
+    drift: Ratio = Field(description="change of eta_d over the measured cycles, of its mean")
+    spread: Ratio = Field(description="range of eta_d over the measured cycles, of its mean")
+    spread_a: Ratio = Field(
+        None, description="range of eta_a over the measured cycles, of its mean; null in old files"
+    )
+
+
+class LevelResult(Contract):
+    """Amplitude control at a step."""
+
+    demanded_m_s2: Acceleration = Field(description="demanded fundamental of the table")
+    error: Ratio = Field(description="relative error of the measured fundamental")
+    error_uncorrected: Ratio = Field(description="the same without the correction")
+    correction: Ratio = Field(description="factor on the command")
+    updates: int = Field(description="changes of the correction at this step")
+    accepted: bool = Field(description="whether the correction was frozen for the measured cycles")
+
+
+class StepMisfit(Contract):
+    """Error of the restarted twin in a channel at a step: of the median of its held cycles."""
+
+    error: SI = Field(description="rms of measured minus twin")
+    band: SI = Field(description="tolerance, see `TwinVerdict.tolerance`")
+    misfit: Ratio = Field(description="error over the noise at rest; null if that is unknown")
+    phase: Literal["flight", "contact_right", "contact_left", ""] = Field(
+        description="phase with the largest error; empty if unknown"
+    )
+
+
+class StepKey(BaseModel):
+    """Keys that a step has in every file, old ones too; it may have more."""
+
+    index: int = Field(description="number of the step in the test, from 0")
+    direction: Direction = Field(description="direction of the sweep")
+    frequency_hz: Hertz = Field(description="frequency of the step")
+
+
+class StepEntry(StepKey, Contract):
+    """Results of a step."""
+
+    measured: Response | None = Field(description="null without a measurement")
+    twin: Response | None = Field(description="null without a twin")
+    table_acc_peak_m_s2: Acceleration = Field(description="peak of the table acceleration")
+    table_acc_fundamental_m_s2: Acceleration = Field(description="its fundamental amplitude")
+    thd: Ratio = Field(description="its total harmonic distortion")
+    agreement: dict[str, StepMisfit] | None = Field(
+        None, description="of the restarted twin by channel; absent without a comparison"
+    )
+
+
+class PlannedStep(StepEntry):
+    """Results of a step of the sweep."""
+
+    level: LevelResult | None = Field(None, description="absent without amplitude control")
+
+
+class AddedStep(StepEntry):
+    """Results of a step that an adaptive policy added."""
+
+    reason: str = Field(description="why it was added")
+
+
+class Jump(Contract):
+    """Jump of one direction between two neighbouring grid frequencies."""
+
+    direction: Direction = Field(description="direction of the sweep")
+    from_hz: Hertz = Field(description="frequency before the jump, in driving order")
+    to_hz: Hertz = Field(description="frequency after the jump")
+    kind: Literal["up", "down"] = Field(
+        description="change of eta_d, or of eta_a if that tells the solutions apart more clearly"
+    )
+
+
+class WorstMisfit(StepMisfit):
+    """Step and channel with the largest error over band; without a step of a whole history."""
+
+    step: int | None = Field(description="number of the step")
+    direction: Direction | None = Field(description="its direction")
+    frequency_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    channel: str = Field(description="channel that departs most")
+    share: Ratio = Field(description="error over band; beyond 1 it is outside the tolerance")
+    error: SI = Field(description="rms of measured minus twin; null for a whole history")
+    band: SI = Field(description="tolerance; null for a whole history")
+
+
+class TwinVerdict(Contract):
+    """Verdict on the twin, apart from that on the test; see `twin.results.twin_verdict`."""
+
+    verdict: Literal["agrees", "departs", "not judged"] = Field(
+        description="whether the twin is within its tolerance and jumps where the rig does"
+    )
+    reason: str = Field(description="what decided it")
+    tolerance: str = Field(description="definition of the band")
+    worst: WorstMisfit | None = Field(description="null if nothing could be judged")
+    steps_outside: int = Field(description="steps with u or a outside the band")
+    steps_judged: int = Field(description="steps with a band")
+    misfit: Ratio = Field(description="of u in multiples of the noise: median over the steps")
+    missing_jumps: list[Jump] = Field(description="jumps of the twin that the rig does not show")
+    unexpected_jumps: list[Jump] = Field(description="jumps of the rig that the twin lacks")
+    warnings: int = Field(description="warnings of the condition monitoring")
+    next_command: str = Field(description="command to type next; DIR is the folder of the run")
+
+
+class HysteresisInterval(Contract):
+    """Interval of at least two grid frequencies at which the directions differ.
+
+    They differ in eta_d, eta_a or in these and the impact counts, beyond the scatter over cycles.
+    """
+
+    kind: Literal["right", "left"] = Field(description="right: the forward branch is larger")
+    from_hz: Hertz = Field(description="first grid frequency at which the directions differ")
+    to_hz: Hertz = Field(description="last grid frequency at which the directions differ")
+
+
+class FaultEntry(Contract):
+    """Failure of a component."""
+
+    index: Index = Field(description="when it was recorded")
+    component: str = Field(description="process that failed")
+    from_index: Index = Field(description="first sample without its output")
+    to_index: Index = Field(description="first sample with its output again")
+    reason: str = Field(description="cause")
+
+
+class CheckEntry(Contract):
+    """Result line of the loop check."""
+
+    index: Index = Field(description="when it was checked")
+    name: str = Field(description="name of the check")
+    channel: str = Field(description="channel that was checked")
+    value: Number = Field(description="measured value, in `unit`")
+    low: Number = Field(description="lowest allowed value, in `unit`")
+    high: Number = Field(description="highest allowed value, in `unit`")
+    unit: str = Field(description="unit of the three numbers")
+    passed: bool = Field(description="whether the value is allowed")
+
+
+class TripEntry(Contract):
+    """Trip of the protection."""
+
+    index: Index = Field(description="sample that tripped")
+    decided: Index = Field(description="sample up to which the session had read")
+    kind: str = Field(description="stroke, velocity, acceleration, force, lost, stuck, level, ...")
+    channel: str = Field(description="channel that tripped")
+    value: SI = Field(description="value that tripped")
+    limit: SI = Field(description="limit that it exceeded")
+    text: str = Field(description="message to the user")
+
+
+class PeakAndRms(Contract):
+    """Peak and rms over a window; null without known samples."""
+
+    peak: SI = Field(description="largest magnitude")
+    rms: SI = Field(description="root mean square")
+
+
+class MotionResult(Contract):
+    """Motion and contact of the specimen over a window."""
+
+    u: PeakAndRms = Field(description="relative displacement in m")
+    a: PeakAndRms = Field(description="total acceleration of the mass in m/s2")
+    force_r: PeakAndRms = Field(description="force of the right bumper in N")
+    force_l: PeakAndRms = Field(description="force of the left bumper in N")
+    impacts_right: int | None = Field(description="contacts that begin on the right")
+    impacts_left: int | None = Field(description="contacts that begin on the left")
+
+
+class ChannelError(Contract):
+    """Errors of the twin in a channel; null where there is nothing to compare."""
+
+    nrmse: Ratio = Field(description="of the twin restarted from the measured state")
+    free_nrmse: Ratio = Field(description="of the free-running twin")
+    noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
+
+
+class WindowResult(Contract):
+    """Results of a window of a displacement history."""
+
+    index: int = Field(description="number of the window")
+    from_s: Seconds = Field(description="begin")
+    to_s: Seconds = Field(description="end")
+    table_disp: PeakAndRms = Field(description="table displacement in m")
+    table_acc: PeakAndRms = Field(description="table acceleration in m/s2")
+    measured: MotionResult | None = Field(description="null without a measurement")
+    twin: MotionResult | None = Field(description="null without a twin")
+    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
+
+
+class RequiredSpectrumResult(Contract):
+    """Test response spectrum (TRS) of the table against the required one (RRS), at 1/6 octave."""
+
+    lower: Ratio = Field(description="least allowed TRS over RRS")
+    upper: Ratio = Field(description="largest allowed TRS over RRS; null without a limit")
+    count: int = Field(description="ordinates of the RRS that were checked")
+    outside: int | None = Field(description="ordinates outside; null if samples are lost")
+    lowest_ratio: Ratio = Field(description="smallest TRS over RRS")
+    lowest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    highest_ratio: Ratio = Field(description="largest TRS over RRS")
+    highest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    passed: bool = Field(description="whether every ordinate is allowed")
+
+
+class TrackingResult(Contract):
+    """Motion of the table against the displacement history that it should follow.
+
+    See `twin.results.tracking`; the criteria are those of Chen et al. (2018). The lag is taken out
+    first. In the band, of spectra and of energy null if samples are lost.
+    """
+
+    from_s: Seconds = Field(description="begin of the history")
+    to_s: Seconds = Field(description="end of the part that was played")
+    band_hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] = Field(
+        description="band of interest, as in the profile or from the energy of the target"
+    )
+    damping: Ratio = Field(description="ratio, of the response spectra")
+    lag_s: Seconds = Field(description="of the table behind its target")
+    acc_rms_error_band: Ratio = Field(
+        description="rms error of the acceleration in the band, of the rms of the target there"
+    )
+    acc_rms_error_full: Ratio = Field(description="the same at all frequencies")
+    pga_ratio_band: Ratio = Field(description="peak acceleration in the band, achieved over target")
+    pga_ratio_full: Ratio = Field(description="the same at all frequencies")
+    sa_share: Ratio = Field(
+        description="share of the ordinates of the 1/6-octave response spectrum in the band that "
+        "are within 10 % of the target"
+    )
+    sa_count: int = Field(description="ordinates of it")
+    sa_worst_ratio: Ratio = Field(description="ordinate farthest from the target, over it")
+    sa_worst_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    sa_fine_share: Ratio = Field(description="as `sa_share`, at 1/72 octave")
+    arias_ratio: Ratio = Field(description="Arias intensity, achieved over target")
+    cav_ratio: Ratio = Field(description="cumulative absolute velocity, achieved over target")
+    disp_rms_error_band: Ratio = Field(
+        description="rms error of the displacement in the band, of the rms of the target there"
+    )
+    disp_rms_error_full: Ratio = Field(description="the same at all frequencies")
+    lost_samples: Index = Field(description="samples of the acceleration that are missing")
+    required_spectrum: RequiredSpectrumResult | None = Field(
+        description="null without one in the profile"
+    )
+
+
+class PlannedOrbitKeys(Contract):
+    """Orbit of the twin at a planned point."""
+
+    frequency_hz: Hertz = Field(description="its frequency")
+    amplitude_m: Metres = Field(description="half of max u - min u")
+    multiplier: Ratio = Field(description="magnitude of its largest Floquet multiplier")
+
+
+class OrbitResult(Contract):
+    """Periodic orbit that a continuation held by feedback."""
+
+    index: int = Field(description="planned point")
+    frequency_hz: Hertz = Field(description="frequency")
+    acceleration_m_s2: Acceleration = Field(description="fundamental of the table, measured")
+    amplitude_m: Metres = Field(description="half of max u - min u")
+    fundamental_m: Metres = Field(description="fundamental of u")
+    phase_deg: Degrees = Field(description="its lead over that of the table's acceleration")
+    feedback_m: Metres = Field(description="root of the sum of squares of its harmonics")
+    feedback_share: Ratio = Field(description="the same over the amplitude of the command")
+    feedback_harmonics_m: list[Metres] = Field(description="amplitudes of harmonics 0, 1, ...")
+    noise_m: Metres = Field(description="part of `feedback_m` that sensor noise explains")
+    periods: int = Field(description="since the change of point")
+    updates: int = Field(description="changes of the reference")
+    accepted: bool = Field(description="the feedback has vanished, on the sought branch")
+    reason: str = Field(description="why it is not accepted; empty if it is")
+    stable: bool = Field(description="without feedback, by the plan")
+    multiplier: Ratio = Field(description="measured Floquet multiplier; null if it was not")
+    multiplier_sd: Ratio | None = Field(description="its standard deviation; null without one")
+    planned: PlannedOrbitKeys = Field(description="orbit of the twin")
+
+
+class MeasuredFold(Contract):
+    """Fold between measured stable and unstable orbits, by a parabola through the nearest."""
+
+    kind: Literal["lower", "upper"] = Field(description="whether the branch turns up or down there")
+    frequency_hz: Hertz = Field(description="where the branch turns")
+    amplitude_m: Metres = Field(description="half of max u - min u there")
+    orbits: int = Field(description="measured orbits that the parabola is fitted to")
+
+
+class Latency(Contract):
+    """Latency of the twin: scheduled last sample of a block to its published Comparison."""
+
+    p50: Milliseconds = Field(description="median")
+    p99: Milliseconds = Field(description="99th percentile")
+    max: Milliseconds = Field(description="largest")
+
+
+class ComponentTiming(Contract):
+    """Latency of a component of the run."""
+
+    index: Index = Field(description="when it was recorded")
+    p50_ms: Milliseconds = Field(description="median latency")
+    p99_ms: Milliseconds = Field(description="99th percentile of the latency")
+    max_ms: Milliseconds = Field(description="largest latency")
+    missed: int = Field(description="missed deadlines")
+    blocks: int = Field(description="blocks processed")
+    cpu_share: Ratio = Field(description="share of one core")
+    scheduler: str = Field(description="scheduling policy")
+
+
+class TimingResult(Contract):
+    """Timing of a run; null where nothing was timed."""
+
+    latency_ms: Latency = Field(description="latency of the twin")
+    missed_deadlines: int | None = Field(description="of all components")
+    components: dict[str, ComponentTiming] = Field(description="timing of each component")
+
+
+class ParameterEstimate(Contract):
+    """Last estimate of a parameter by the condition monitoring, SI."""
+
+    value: SI = Field(description="estimate")
+    sd: SI = Field(description="its standard deviation")
+    drift: SI = Field(description="change since the first estimate")
+    drift_sd: SI = Field(description="standard deviation of the drift")
+
+
+class WarningEntry(Contract):
+    """Warning of the condition monitoring."""
+
+    at_s: Seconds = Field(description="time in the test")
+    kind: str = Field(description="kind of the event")
+    text: str = Field(description="message to the user")
+    is_clipped: bool = Field(
+        False, description="a sensor of the motion was off its range in the step that it is about"
+    )
+
+
+class VersionPair(Contract):
+    """Versions of a package."""
+
+    recorded: str | None = Field(description="in the recording")
+    installed: str | None = Field(description="here")
+
+
+class ReplayResult(Contract):
+    """Comparison of a replay with its recording."""
+
+    of: str = Field(description="path of the recording")
+    run: str = Field(description="its name")
+    model: str | None = Field(description="model of the replay, or `recorded`")
+    identical: bool | None = Field(description="null if it cannot be judged")
+    beginning: str | None = Field(description="run with the earlier samples")
+    comparisons: int = Field(description="comparisons in the recording")
+    compared: int = Field(description="comparisons of both")
+    differing: int = Field(description="comparisons that differ")
+    missing: int = Field(description="recorded, but not made by the replay")
+    unrecorded: int = Field(description="made by the replay, but not recorded")
+    lost_with_twin: int = Field(
+        0, description="made by the replay, not recorded because the twin died"
+    )
+    hashes: int = Field(0, description="hashes of predictions in the recording")
+    hashes_compared: int = Field(0, description="hashes of both")
+    hashes_differing: int = Field(0, description="hashes that differ")
+    predictions_compared: int = Field(
+        0, description="blocks of predictions of both, where the recording has a part of them"
+    )
+    predictions_differing: int = Field(0, description="blocks of predictions that differ")
+    first_difference_index: Index | None = Field(description="first sample that differs")
+    largest_difference_of_error_sums: dict[str, SI] = Field(description="by channel, SI squared")
+    relative_difference: dict[str, Ratio] = Field(
+        description="rms(new - old) / rms(old) by predicted channel; empty if identical"
+    )
+    versions_differing: dict[str, VersionPair] = Field(description="by package")
+    recorded_comparison: dict[str, ChannelError] = Field(description="errors as recorded")
+
+
+class SummaryKeys(BaseModel):
+    """Keys that every summary.json of a run has, old ones too; it may have more."""
+
+    run: BaseModel = Field(description="origin and length of the recording")
+    verdict: str = Field(description="how the test ended: complete, stopped, aborted or halted")
+    steps: Sequence[StepKey] = Field(description="planned steps that were measured, in order")
+
+
+class RunSummary(SummaryKeys, Contract):
+    """summary.json of a run, a replay or a simulation."""
+
+    run: RunInfo = Field(description="origin and length of the recording")
+    steps: list[PlannedStep] = Field(description="planned steps that were measured, in order")
+    planned_steps: int | None = Field(None, description="of the sweep; absent in old files")
+    reason: str = Field(description="why the test ended")
+    gaps: int = Field(description="gaps in the recording")
+    lost_samples: Index = Field(description="samples missing in the file")
+    clipped_channels: list[str] = Field(
+        [], description="of the motion, with samples off the range of the sensor"
+    )
+    clipped_steps: list[Index] = Field(
+        [], description="with a sensor of the motion off its range; absent in old files"
+    )
+    faults: list[FaultEntry] = Field(description="failures of components")
+    u_star_m: Metres = Field(description="u* that normalizes displacements; null without steps")
+    a_star_m_s2: Acceleration = Field(description="a* that normalizes accelerations")
+    checks: list[CheckEntry] = Field(description="loop check")
+    trips: list[TripEntry] = Field(description="trips of the protection")
+    windows: list[WindowResult] | None = Field(
+        None, description="of a displacement history; absent for a stepped sine"
+    )
+    tracking: TrackingResult | None = Field(
+        None, description="of the table, in a displacement history that was measured"
+    )
+    orbits: list[OrbitResult] | None = Field(
+        None, description="of a continuation, in order of measurement; absent otherwise"
+    )
+    folds: list[MeasuredFold] | None = Field(
+        None, description="of the branch of a continuation; absent otherwise and in old files"
+    )
+    visits: list[AddedStep] = Field(description="steps added during the test, not in the PRC")
+    findings: list[str] = Field(alias="found", description="of the adaptive policies")
+    jumps: list[Jump] = Field(description="jumps of `run.branches_from`")
+    hysteresis: list[HysteresisInterval] = Field(description="hysteresis of `run.branches_from`")
+    twin_jumps: list[Jump] = Field(description="jumps of the twin")
+    twin_hysteresis: list[HysteresisInterval] = Field(description="hysteresis of the twin")
+    timing: TimingResult = Field(description="latencies")
+    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
+    estimates: dict[str, ParameterEstimate] = Field(description="by parameter")
+    warnings: list[WarningEntry] = Field(description="warnings of the condition monitoring")
+    twin_verdict: TwinVerdict | None = Field(
+        None, description="on the twin, apart from `verdict` on the test; absent in old files"
+    )
+    replay: ReplayResult | None = Field(None, description="absent unless it is a replay")
+    sha256: str | None = Field(None, description="hash of run.mcap; only in a campaign")
+
+
+class Interval(Contract):
+    """Fitted value with its 95 % interval."""
+
+    value: Number = Field(description="estimate, in `unit`")
+    low: Number = Field(description="lower end, in `unit`")
+    high: Number = Field(description="upper end, in `unit`")
+    unit: str = Field(description="unit of the three numbers; empty for a ratio")
+
+
+class EffectResult(Contract):
+    """Effect that the model lacks."""
+
+    id: str = Field(description="id in the library of effects")
+    channel: str | None = Field(None, description="of a sensor effect; absent for others")
+    confidence: Ratio = Field(description="confidence in the effects, 0 to 1")
+    parameters: dict[str, Interval] = Field(description="fitted parameters")
+    slip_speed: Interval | None = Field(None, description="only of Coulomb friction")
+
+
+class CandidateResult(Contract):
+    """Set of effects that was refitted."""
+
+    id: str = Field(description="its effects, joined by +, or `nothing added`")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    converged: bool = Field(description="whether the fit converged")
+    at_bound: list[str] | None = Field(None, description="parameters at a bound; absent if none")
+
+
+class Location(Contract):
+    """Where model and measurement disagree; empty or null if nowhere."""
+
+    frequency_hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] | None = Field(
+        description="lowest and highest frequency"
+    )
+    direction: str = Field(description="forward, backward or both")
+    phase: str = Field(description="flight, contact_right, contact_left, contact_both or all")
+    channels: list[str] = Field(description="residual rows")
+    harmonics: list[int] = Field(description="orders of the forcing frequency")
+
+
+class Gap(Contract):
+    """Misfit of model and measurement: rms residual over the sensor noise."""
+
+    metric: str = Field(description="definition of the numbers")
+    given: Ratio = Field(
+        None, description="of the model as given, without any fit; null in old files"
+    )
+    before: Ratio = Field(description="of the model, on all data")
+    after: Ratio = Field(description="with the effects added, on all data")
+    noise_floor: Ratio = Field(description="residual that noise alone leaves")
+    held_out_before: Ratio = Field(description="of the model, cross-validation")
+    held_out_after: Ratio = Field(description="with the effects added, cross-validation")
+    closed_fraction: Ratio = Field(
+        description="share of the misfit above the noise that the effects remove"
+    )
+
+
+class MisfitStep(Contract):
+    """Step of the staircase from the model as given to the noise floor."""
+
+    label: str = Field(description="what was changed last")
+    misfit: Ratio = Field(description="rms residual over the noise, held out where it was fitted")
+
+
+class ExcludedSet(Contract):
+    """Effects that were fitted in place of those of the verdict, and fit worse."""
+
+    id: str = Field(description="its effects, joined by +")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    sigma: Ratio = Field(description="standard errors by which it is worse")
+
+
+class GenericTerm(Contract):
+    """Generic term that fits better than every library effect."""
+
+    term: str = Field(description="its formula")
+    meaning: str = Field(description="scales of the symbols")
+    held_out_error: Ratio = Field(description="rms cross-validation residual over the noise")
+    parameters: dict[str, Interval] = Field(description="fitted parameters")
+
+
+class Remainder(Contract):
+    """Part of the misfit that remains."""
+
+    unexplained: bool = Field(description="whether it exceeds an inexact force law")
+    evidence: GenericTerm | None = Field(description="null without a better generic term")
+
+
+class HeldOutLog(Contract):
+    """Errors of the damper force on a log that was held out entirely."""
+
+    log: str = Field(description="name of the log")
+    nrmse_given: Ratio = Field(None, description="of the model as given, not fitted")
+    nrmse_before: Ratio = Field(description="of the model, refitted to the other logs")
+    nrmse_after: Ratio = Field(description="with the effects added")
+    noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
+
+
+class SensorCheckResult(Contract):
+    """Checked quantity of an instrument, see `twin.discovery.sensor_checks`."""
+
+    log: str = Field(description="name of the log")
+    kind: str = Field(description="checked quantity")
+    channels: list[str] = Field(description="its channels, or the side of a gap")
+    value: Number = Field(description="estimate, in `unit`")
+    low: Number = Field(description="lower end of its 95 % interval, in `unit`")
+    high: Number = Field(description="upper end of its 95 % interval, in `unit`")
+    unit: str = Field(description="unit of the numbers; empty for a ratio")
+    limit: Number | None = Field(description="size that is allowed; null if there is no limit")
+    healthy: bool = Field(description="whether the interval reaches the allowed sizes")
+
+
+class Sensors(Contract):
+    """Verdict on the instruments, apart from the physics of the specimen."""
+
+    state: Literal["healthy", "to be mended"] = Field(description="of all instruments together")
+    checks: list[SensorCheckResult] = Field(description="what was checked")
+
+
+class LawTerm(Contract):
+    """Term of a proposed law: an effect file next to the model file."""
+
+    id: str = Field(description="name of the effect and of its file")
+    title: str = Field(description="the law in words")
+    place: str = Field(description="where it acts")
+    force: str = Field(description="expression of the force in N, or acceleration in m/s2")
+    states: dict[str, str] = Field(description="expressions of the rates of internal states")
+    parameters: dict[str, Interval] = Field(description="fitted parameters and references")
+    range: dict[str, list[SI]] = Field(description="measured range of the variables")
+
+
+class LawClass(Contract):
+    """Best law of a class."""
+
+    law_class: str = Field(description="class of laws")
+    id: str = Field(description="best law of the class")
+    held_out_error: Ratio = Field(description="rms over the noise, on held-out steps")
+
+
+class ProposedLaw(Contract):
+    """Law for what no effect of the library explains."""
+
+    terms: list[LawTerm] = Field(description="terms of the law, added up")
+    with_effects: list[str] = Field(description="effects of the library that it needs")
+    base: dict[str, Interval] = Field(description="refitted parameters of the model with it")
+    law_class: str = Field(description="class of the law")
+    held_out_before: Ratio = Field(description="misfit without the law, on held-out steps")
+    held_out_after: Ratio = Field(description="misfit with it")
+    noise_floor: Ratio = Field(description="misfit that noise alone leaves")
+    closed_fraction: Ratio = Field(description="share of the misfit over the floor that it closes")
+    sufficient: bool = Field(description="whether it leaves hardly more than the floor")
+    nearest: str = Field(description="best single effect of the library")
+    classes: list[LawClass] = Field(description="best law of each class, best first")
+
+
+class ExpectedPeak(Contract):
+    """Predicted peak of the relative displacement in a step or window of a test."""
+
+    frequency_hz: Annotated[Number, _declare_unit("Hz")] = Field(
+        description="of the step; null in a displacement history"
+    )
+    direction: str = Field(description="of the step, or the window of a history")
+    peak_disp_m: Metres = Field(description="largest displacement of the mass against the table")
+
+
+class RivalPrediction(Contract):
+    """Explanation that the recordings leave open, with what a test is expected to show of it."""
+
+    id: str = Field(description="its effects, joined by +")
+    misfit: Ratio = Field(description="rms residual over the noise if another is true; or null")
+    sigma: Ratio = Field(description="standard errors by which the rest is worse if true; or null")
+    peaks: list[ExpectedPeak] = Field(description="if it is true; empty if it is no whole model")
+
+
+class OtherTest(Contract):
+    """Test that was compared with the proposed one."""
+
+    title: str = Field(description="what is played")
+    minutes: Minutes = Field(description="expected duration in min")
+    sigma: Ratio = Field(description="expected separation in standard errors")
+    probability: Ratio = Field(description="that it decides")
+
+
+class DecisiveTest(Contract):
+    """Test proposed by `discover --decide`, with what is expected of it."""
+
+    title: str = Field(description="what is played")
+    purpose: str = Field(description="what it decides")
+    profile: str = Field(description="file of its profile")
+    set_up: str = Field(description="change by hand before it; empty for none")
+    confirmation: bool = Field(description="whether nothing is open and it looks for more effects")
+    minutes: Minutes = Field(description="expected duration in min")
+    sigma: Ratio = Field(description="expected separation in standard errors")
+    probability: Ratio = Field(description="that it decides; of a confirmation per hidden effect")
+    separation_per_min: Ratio = Field(description="expected log likelihood ratio a minute")
+    count: int = Field(description="tests that were compared")
+    rivals: list[RivalPrediction] = Field(description="explanations, that of the verdict first")
+    others: list[OtherTest] = Field(description="the next best tests")
+
+
+class ChainLink(Contract):
+    """Verdict in a chain of tests, and the test that was played before it."""
+
+    verdict: str = Field(description="none, named, ambiguous or unexplained")
+    effects: list[str] = Field(description="effects of the verdict")
+    confidence: Ratio = Field(description="of its effects; null without any")
+    played: str = Field(description="test that was played for it; empty for the first")
+    minutes: Minutes = Field(description="duration of that test in min")
+    probability: Ratio = Field(description="that was stated for a decision; null for the first")
+    log: str = Field(description="recording of that test; empty for the first")
+
+
+class Verdict(Contract):
+    """verdict.json of a discovery."""
+
+    verdict: Literal["none", "named", "ambiguous", "unexplained"] = Field(
+        description="whether the missing effects could be named"
+    )
+    why: str = Field(description="reason of the verdict")
+    effects: list[EffectResult] = Field(description="effects added to the model")
+    ambiguous: list[list[str]] = Field(description="sets of effects that fit as well")
+    candidates: list[CandidateResult] = Field(description="every refitted set, best first")
+    where: Location = Field(description="where model and measurement disagree")
+    gap: Gap = Field(description="misfit before and after")
+    staircase: list[MisfitStep] | None = Field(
+        None, description="misfit from the model as given to the noise floor; absent in old files"
+    )
+    excluded: list[ExcludedSet] | None = Field(
+        None, description="rivals of the effects, best first; absent in old files"
+    )
+    remainder: Remainder = Field(description="part of the misfit that remains")
+    law: ProposedLaw | None = Field(
+        None, description="law for what no effect explains; absent in old files"
+    )
+    sensors: Sensors | None = Field(None, description="on the instruments; absent in old files")
+    base: dict[str, Interval] = Field(description="refitted parameters of the given model")
+    fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
+    notes: list[str] = Field(description="notes to the user")
+    blind_to: list[str] | None = Field(
+        None, description="effects that could be there without a trace; absent in old files"
+    )
+    form_errors: dict[str, Number] | None = Field(
+        None,
+        description="half of the 95 % interval of each parameter, in its SI unit, for a law that "
+        "has another form than in the library, unseen; absent in old files",
+    )
+    next_run: str = Field(description="test that would decide or confirm")
+    seconds: Seconds = Field(description="computing time")
+    held_out_logs: list[HeldOutLog] = Field(description="of the logs given to judge the result")
+    decide: DecisiveTest | None = Field(
+        None, description="test of `--decide`; null where none separates, absent without the option"
+    )
+    chain: list[ChainLink] | None = Field(
+        None, description="verdicts so far, this one last; absent without `--run`"
+    )
+
+
+class PredictedFeatureResult(Contract):
+    """What a model predicts for a feature."""
+
+    text: str = Field(description="prediction in words")
+    distance: Ratio = Field(description="distance from the feature in tolerances; null: none such")
+    explained: bool = Field(description="whether the distance is at most 1")
+    method: str = Field(description="continuation, stepped sweeps or simulation")
+
+
+class FeatureResult(Contract):
+    """A published feature, and what each model predicts for it."""
+
+    kind: str = Field(description="kind of the feature, as in the features file")
+    gap_m: Annotated[Number, _declare_unit("m")] = Field(
+        description="total gap; null without bumpers, and of permanent contact"
+    )
+    published: str = Field(description="feature in words")
+    place: str = Field(description="where it is published")
+    given: PredictedFeatureResult = Field(description="of the model as given")
+    refitted: PredictedFeatureResult = Field(description="of the refitted base")
+    best: PredictedFeatureResult = Field(description="of the best model")
+
+
+class FeatureFitResult(Contract):
+    """A fit of effects to the features."""
+
+    effects: list[str] = Field(description="its added effects; empty: the base")
+    explained: int = Field(description="number of features that it explains")
+    gained: list[int] = Field(
+        description="features that it explains and the refitted base does not"
+    )
+    lost: list[int] = Field(description="features that only the refitted base explains: the price")
+    misfit: Ratio = Field(description="sum of log(1 + squared distance) of all features")
+    parameters: dict[str, Interval] = Field(description="fitted parameters, base and effects")
+
+
+class FeatureVerdict(Contract):
+    """features.json of a discovery from features; features are numbered from 0."""
+
+    verdict: Literal["none needed", "named", "ambiguous"] = Field(
+        description="whether an effect explains more features than the refitted base, and one only"
+    )
+    why: str = Field(description="reason of the verdict")
+    title: str = Field(description="title of the features file")
+    citation: str = Field(description="source of the features")
+    model: str = Field(description="title of the model")
+    features: list[FeatureResult] = Field(description="every feature, in the file's order")
+    given: FeatureFitResult = Field(description="model as given")
+    refitted: FeatureFitResult = Field(description="its base refitted, without any effect")
+    fits: list[FeatureFitResult] = Field(description="effects and pairs, best first")
+    best: list[str] = Field(description="effects of the best model; empty: the refitted base")
+    unexplained: list[int] = Field(description="features that the best model does not explain")
+    next_run: str = Field(description="test that would decide between the best two")
+    fell_away: dict[str, str] = Field(description="reason of each effect that was not tested")
+    notes: list[str] = Field(description="notes to the user")
+    seconds: Seconds = Field(description="computing time")

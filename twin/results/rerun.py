@@ -1,0 +1,165 @@
+"""Rerun of the twin on the measured samples of a recording, and the predictions not recorded."""
+
+import heapq
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+from table_io.block import Block
+from table_io.errors import InputError
+from table_io.records import (
+    Agreement,
+    Comparison,
+    CycleExtremes,
+    Estimate,
+    Event,
+    Fault,
+    JumpForecast,
+    Params,
+    PrcPoint,
+    PredictionHash,
+    RunStart,
+    StepAdded,
+    Timing,
+)
+from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
+from twin.recording.mcap_log import write_items
+from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
+from twin.results.recordings import open_recording, read_recorded_config
+from twin.setup.run_config import RunConfig
+from twin.system.terminal import error_console
+from twin.transport.codec import Item
+
+DRIVE_CHANNEL = "table_acc_m_s2"  # of the twin
+BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
+TWIN_RECORDS = (
+    Comparison, PredictionHash, Params, CycleExtremes, PrcPoint, Agreement, Estimate, JumpForecast,
+)  # fmt: skip
+
+
+def rerun_twin(
+    recording: Recording, config: RunConfig, block_samples: int = 0, edges: Iterable[int] = ()
+) -> Iterator[Item]:
+    """Yield the rig's items and the recomputed results of the twin, without the start record.
+
+    Recorded faults of the twin and changes of its parameters are repeated. Blocks have
+    `block_samples`, 0 for about a second, and end at each sample of `edges` too.
+    """
+    from twin.compare import pipeline  # compiles kernels that are not cached
+
+    block_samples = block_samples or round(BLOCK_DURATION_S * recording.start.rate_hz)
+    setup = config.prepare_twin(from_rest=recording.start.source == "model")
+    setup = pipeline.add_steps(setup, *recording.records(StepAdded))
+    faults = [fault for fault in recording.records(Fault) if fault.component == "twin"]
+    changes = _parameter_changes(recording, config)
+    cuts = {*edges, *(change.index for change in changes)}
+    cuts |= {edge for fault in faults for edge in (fault.from_index, fault.to_index)}
+    state, start_records = pipeline.start_pipeline(setup, recording.start.index)
+    yield from start_records
+    for item in _iter_source(recording, block_samples, sorted(cuts)):
+        yield item
+        if not isinstance(item, Block):
+            continue
+        while changes and changes[0].index <= item.index:
+            setup = pipeline.adopt_params(setup, changes[0])
+            yield changes.pop(0)
+        if not any(fault.from_index <= item.index < fault.to_index for fault in faults):
+            if any(fault.to_index == item.index for fault in faults):
+                state, start_records = pipeline.start_pipeline(setup, item.index)
+                yield from start_records
+            state, new_records = pipeline.step(setup, state, item)
+            yield from new_records
+
+
+def _parameter_changes(recording: Recording, config: RunConfig) -> list[Params]:
+    """Return the parameter changes during the run; empty for a model other than the recorded."""
+    if config.model_toml != recording.start.model_toml:
+        return []
+    return [params for params in recording.records(Params) if params.reason != "start"]
+
+
+def _iter_source(recording: Recording, block_samples: int, edges: list[int]) -> Iterator[Item]:
+    """Yield the rig's items by sample index, in blocks of `block_samples`, also cut at `edges`."""
+
+    def iter_blocks() -> Iterator[Block]:
+        for block in recording.contiguous_blocks("meas"):
+            boundaries = range(
+                block.index - block.index % block_samples + block_samples, block.end, block_samples
+            )
+            inside = (edge for edge in edges if block.index < edge < block.end)
+            for first, last in pairwise(sorted({block.index, *boundaries, *inside, block.end})):
+                yield block.cut(first, last)
+
+    records: Iterable[Item] = [item for item in recording.items if is_rig_item(item)]
+    yield from heapq.merge(iter_blocks(), records, key=lambda item: item.index)
+
+
+def is_rig_item(item: Item) -> bool:
+    """Return whether an item comes from the rig and is copied, not recomputed by the twin."""
+    if isinstance(item, Event):
+        from twin.compare.pipeline import EVENT_KINDS
+
+        # "divergence" is a twin event kind in old logs
+        return item.kind not in (*EVENT_KINDS, "divergence")
+    return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))
+
+
+def restore_predictions(recording: Recording, config: RunConfig | None = None) -> Recording:
+    """Return a recording with all predictions: those that were not recorded are recomputed.
+
+    A recording with all of them is returned itself. Each hash is compared with the recorded one; a
+    warning says where predictions are missing or are not those of the run.
+    """
+    if recording.start.has_all_predictions:
+        return recording
+    try:
+        if DRIVE_CHANNEL not in recording.start.channels:
+            raise InputError("drives the twin, but was not recorded", key=DRIVE_CHANNEL)
+        config = config or read_recorded_config(recording)
+    except InputError as error:
+        _warn(recording, f"only a part is recorded, and the rest cannot be recomputed: {error}")
+        return recording
+    sample_count = sum(map(len, recording.contiguous_blocks("meas")))
+    store = BlockStore(lambda _: sample_count)
+    blocks: list[StoredItem] = []
+    hashes: dict[int, PredictionHash] = {}
+    for item in rerun_twin(recording, config):
+        if isinstance(item, Block) and item.stream == "pred":
+            blocks.append(store.add(item))
+        elif isinstance(item, PredictionHash):
+            hashes[item.index] = item
+    recorded = recording.records(PredictionHash)
+    differing = sum(hashes.get(entry.index) != entry for entry in recorded)
+    if differing:
+        _warn(recording, f"{differing} of {len(recorded)} hashes differ from those of the run")
+    start = replace(recording.start, predictions_every=0)
+    others = [
+        start if isinstance(entry, RunStart) else entry
+        for entry in recording.items.entries
+        if not (isinstance(entry, StoredBlock) and entry.stream == "pred")
+    ]
+    entries = sorted(
+        [*others, *blocks], key=lambda entry: (entry.index, TOPIC_ORDER[find_topic(entry)])
+    )
+    return replace(recording, start=start, items=StoredItems(entries))
+
+
+def _warn(recording: Recording, problem: str) -> None:
+    error_console.print(
+        f"warning: predictions of {recording.path}: {problem}; see `shaketwin replay`",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def restore_log(path: Path, folder: Path) -> Path:
+    """Return a log with all predictions: `path` itself, or a copy of it in `folder`."""
+    if read_start(path).has_all_predictions:
+        return path
+    recording = open_recording(path)
+    restored = restore_predictions(recording)
+    if restored is recording:
+        return path
+    write_items(folder / path.name, list(restored.items), restored.start)
+    return folder / path.name

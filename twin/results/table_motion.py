@@ -1,0 +1,215 @@
+"""Motion of the table against its target: tracking error of a run, and its required spectrum."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Block, Float1D, Label
+from table_io.config.excitation import History, history_acceleration
+from table_io.config.profile import Profile
+from table_io.config.tracking import RequiredSpectrum, TrackingConfig
+from twin.recording.reader import Recording
+from twin.results.spectra import (
+    USUAL_PER_OCTAVE,
+    compute_response_spectrum,
+    list_octave_frequencies,
+)
+from twin.results.tracking import MAX_BAND_RATIO, MAX_LAG_S, judge_tracking
+from twin.results.windows import find_windows, join_channel
+
+Json = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TableMotion:
+    """Target and achieved motion of the table, (sample,) each in SI, from sample `first` on.
+
+    `start` and `end` are the samples of the recording between which the history was played; the
+    rest around it is part of the motion, as far as it was recorded and no more than MAX_LAG_S. Lost
+    samples of the achieved motion are NaN.
+    """
+
+    rate_hz: float
+    first: int
+    start: int
+    end: int
+    target_disp_m: Float1D
+    target_acc_m_s2: Float1D
+    achieved_disp_m: Float1D
+    achieved_acc_m_s2: Float1D
+
+    @property
+    def time_s(self) -> Float1D:
+        """Time in the recording, (sample,)."""
+        return (self.first + np.arange(self.target_disp_m.size)) / self.rate_hz
+
+
+def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | None:
+    """Return the motion of the table of a displacement history; None of other tests.
+
+    None too if nothing was measured, the test ended before the history moved, or the recording
+    lacks its begin, without which the target has no place in time.
+    """
+    blocks = recording.contiguous_blocks("meas")
+    windows = find_windows(blocks)
+    excitation, rate_hz = profile.excitation, recording.start.rate_hz
+    if not isinstance(excitation, History) or not windows or recording.start.source != "table":
+        return None
+    history = excitation.target(rate_hz)
+    start = min(first for first, _ in windows.values())
+    end = min(max(last for _, last in windows.values()), start + history.size)
+    margin = round(MAX_LAG_S * rate_hz)
+    before = _count_rest(blocks, range(start - 1, start - 1 - margin, -1))
+    if 0 not in windows or (before == 0 and start > recording.start.index):
+        return None
+    is_whole = end == start + history.size
+    after = _count_rest(blocks, range(end, end + margin)) if is_whole else 0
+    target = np.pad(history[: end - start], (before, after))
+    acceleration = np.pad(history_acceleration(history, rate_hz)[: end - start], (before, after))
+    first = start - before
+    achieved_disp, achieved_acc = (
+        _extract_channel(blocks, name, first, end + after)
+        for name in ("table_disp_m", "table_acc_m_s2")
+    )
+    if not acceleration.any() or not np.isfinite(achieved_acc).any():
+        return None
+    return TableMotion(
+        rate_hz, first, start, end, target, acceleration, achieved_disp, achieved_acc
+    )
+
+
+def _count_rest(blocks: tuple[Block, ...], samples: range) -> int:
+    """Return how many samples, in this order, were recorded at rest without a break."""
+    at_rest: set[int] = set()
+    low, high = min(samples), max(samples) + 1
+    for block in blocks:
+        if block.index < high and low < block.end:
+            part = block.cut(max(low, block.index), min(high, block.end))
+            at_rest |= set((np.flatnonzero(part.label == Label.REST) + part.index).tolist())
+    for count, sample in enumerate(samples):
+        if sample not in at_rest:
+            return count
+    return len(samples)
+
+
+def _extract_channel(blocks: tuple[Block, ...], name: str, first: int, end: int) -> Float1D:
+    """Return a channel at the samples first .. end - 1, NaN where there is none."""
+    values = np.full(end - first, np.nan)
+    for block in blocks:
+        if block.index < end and first < block.end:
+            part = block.cut(max(first, block.index), min(end, block.end))
+            values[part.index - first : part.end - first] = join_channel([part], name)
+    return values
+
+
+def summarise_tracking(recording: Recording, profile: Profile) -> Json | None:
+    """Return the entry `tracking` of a summary, see `TrackingResult`; None without a target."""
+    motion = find_table_motion(recording, profile)
+    if motion is None:
+        return None
+    config = profile.tracking
+    band_hz = config.band_hz
+    if band_hz is not None and band_hz[1] > motion.rate_hz / 2:
+        band_hz = None  # of a recording at another rate than that of the profile
+    has_displacement = bool(np.isfinite(motion.achieved_disp_m).any())
+    error = judge_tracking(
+        motion.target_acc_m_s2,
+        motion.achieved_acc_m_s2,
+        motion.rate_hz,
+        band_hz,
+        damping=config.damping,
+        target_disp=motion.target_disp_m if has_displacement else None,
+        achieved_disp=motion.achieved_disp_m,
+    )
+    entry = asdict(error) | {
+        "band_hz": list(error.band_hz),
+        "from_s": motion.start / motion.rate_hz,
+        "to_s": motion.end / motion.rate_hz,
+    }
+    required = config.spectrum
+    entry["required_spectrum"] = (
+        None if required is None else _check_required(motion, required, config)
+    )
+    return entry
+
+
+def list_required_frequencies(required: RequiredSpectrum, rate_hz: float) -> Float1D:
+    """Return the frequencies in Hz, 1/6 octave apart, at which a spectrum is checked, (k,)."""
+    low_hz, high_hz = required.frequencies_hz[[0, -1]].tolist()
+    high_hz = min(high_hz, MAX_BAND_RATIO * rate_hz)
+    if high_hz < low_hz:
+        return np.empty(0)
+    return list_octave_frequencies(low_hz, high_hz, USUAL_PER_OCTAVE)
+
+
+def _check_required(
+    motion: TableMotion, required: RequiredSpectrum, config: TrackingConfig
+) -> Json:
+    """Return the check of the spectrum of the table against the required one."""
+    hz = list_required_frequencies(required, motion.rate_hz)
+    entry: Json = {
+        "lower": config.required_lower,
+        "upper": config.required_upper,
+        "count": hz.size,
+        "outside": None,
+        "lowest_ratio": None,
+        "lowest_hz": None,
+        "highest_ratio": None,
+        "highest_hz": None,
+        "passed": False,
+    }
+    if not hz.size or not np.isfinite(motion.achieved_acc_m_s2).all():
+        return entry
+    spectrum = compute_response_spectrum(
+        motion.achieved_acc_m_s2, motion.rate_hz, hz, config.damping
+    )
+    ratios = spectrum.absolute_acceleration_m_s2 / required.interpolate(hz)
+    outside = int(
+        np.count_nonzero((ratios < config.required_lower) | (ratios > config.required_upper))
+    )
+    lowest, highest = int(np.argmin(ratios)), int(np.argmax(ratios))
+    return entry | {
+        "outside": outside,
+        "lowest_ratio": float(ratios[lowest]),
+        "lowest_hz": float(hz[lowest]),
+        "highest_ratio": float(ratios[highest]),
+        "highest_hz": float(hz[highest]),
+        "passed": outside == 0,
+    }
+
+
+def format_tracking(tracking: Json) -> str:
+    """Format the tracking error of a summary in one sentence: RMS, PGA, SA, lag, RRS."""
+    low_hz, high_hz = tracking["band_hz"]
+    band = f"{low_hz:.2g} to {high_hz:.2g} Hz"
+    parts = [
+        f"table acceleration {_format_percent(tracking['acc_rms_error_band'])} RMS off its target "
+        f"in {band} ({_format_percent(tracking['acc_rms_error_full'])} in full)",
+        f"PGA {_format_percent(tracking['pga_ratio_band'])} of it "
+        f"({_format_percent(tracking['pga_ratio_full'])})",
+    ]
+    if tracking["sa_count"]:
+        inside = round(tracking["sa_share"] * tracking["sa_count"])
+        parts.append(f"{inside} of {tracking['sa_count']} SA within 10 %")
+    parts.append(f"lag {1e3 * tracking['lag_s']:.3g} ms")
+    if tracking["lost_samples"]:
+        parts.append(f"{tracking['lost_samples']} samples lost")
+    required = tracking["required_spectrum"]
+    if required is not None:
+        parts.append(format_required(required))
+    return ", ".join(parts)
+
+
+def format_required(required: Json) -> str:
+    """Format the check of a required spectrum."""
+    if required["outside"] is None:
+        return "required spectrum not checked"
+    if required["passed"]:
+        return "required spectrum met"
+    return f"required spectrum missed at {required['outside']} of {required['count']} ordinates"
+
+
+def _format_percent(ratio: float | None) -> str:
+    return f"{100 * ratio:.3g} %" if ratio is not None and math.isfinite(ratio) else "–"

@@ -1,0 +1,435 @@
+"""Verdict on the twin: does it agree with the rig, or depart from it?
+
+The twin is judged where it can be: the twin restarted from the measured state, step by step,
+against 3 x noise at rest + 5 % of the amplitude (`twin.compare.monitoring.agreement`). This holds
+for chaotic motions too, on which the free-running twin cannot stay. The median over the held
+cycles of a step counts, so that neither the jump itself nor a filter that settles is a misfit. Of
+the free-running twin only the jumps are judged: it must jump within a step of the grid, or within
+the uncertainty of a gap. A displacement history has no cycles: its NRMSE is judged, against
+sqrt(noise^2 + 5 %^2).
+
+One step outside is a departure; agreement needs at least half of the measured steps judged, and
+holds for what was measured: the reason states its share of the planned steps.
+
+A step in which a sensor of the motion was off its range (clipped) says nothing about the twin.
+
+A bumper touched 0.1 mm too early or late belongs to every set-up, so its share of the error is
+added to the band. Forces are not judged by step, because the cells of a side may share their force
+unequally; the monitoring judges their sum, and its warning counts here.
+"""
+
+import math
+import shlex
+from collections.abc import Container, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.block import Block, Bool1D, Float1D
+from table_io.config.profile import Profile
+from table_io.records import Agreement
+from twin.compare.monitoring.agreement import (
+    AMPLITUDE_TOLERANCE,
+    GAP_ERROR_M,
+    NOISE_FACTOR,
+    detect_contact,
+    set_up_allowances,
+)
+from twin.compare.monitoring.jumps import JUMP_TOLERANCE
+from twin.model.parameters import Parameters
+from twin.recording.reader import Recording
+from twin.results.quantities import format_quantity
+
+Json = dict[str, Any]
+CHANNEL_SYMBOLS = {"rel_disp_m": ("u", "m"), "mass_acc_m_s2": ("a", "m/s2")}
+JUDGED_CHANNELS = tuple(CHANNEL_SYMBOLS)
+UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
+MOTION_SENSORS = (
+    "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
+)  # fmt: skip
+CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
+PHASES = ("flight", "contact_right", "contact_left")
+DEPARTURE_KIND = "disagreement"  # of warnings
+JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
+MAX_UNREMARKABLE_MISFIT = 3.0  # times the noise: beyond it, parameters or effects can be found
+NOTHING_MEASURED = "nothing was measured that the twin predicts"
+HISTORY_TOLERANCE_TEXT = f"{100 * AMPLITUDE_TOLERANCE:g} % of the rms, beyond the noise"
+TOLERANCE_TEXT = (
+    f"{NOISE_FACTOR:g} x noise at rest + {100 * AMPLITUDE_TOLERANCE:g} % of the amplitude"
+    f" + {1e3 * GAP_ERROR_M:g} mm of gap in contact"
+)
+
+
+def summarise_agreement(
+    recording: Recording,
+    parameters: Parameters,
+    profile: Profile,
+    noise_rms: Mapping[str, float],
+    clipped: Container[int],
+) -> dict[int, Json]:
+    """Return by step and channel the error of the restarted twin, its band and its phase.
+
+    The cycle is that with the median of error over band; rms in SI, `misfit` in multiples of the
+    noise. Channels without a known error or band are absent, as are cycles of which the end is in
+    `clipped`.
+    """
+    by_step: dict[int, list[Agreement]] = {}
+    for record in recording.records(Agreement):
+        if record.index not in clipped:
+            by_step.setdefault(record.step, []).append(record)
+    motion = _measure_motion(recording, profile) if by_step else {}
+    return {
+        step: _summarise_step(
+            records, set_up_allowances(parameters, *motion.get(step, UNKNOWN))[0], noise_rms
+        )
+        for step, records in by_step.items()
+    }
+
+
+def list_clipped_channels(recording: Recording) -> list[str]:
+    """Return the channels of the motion of which samples were off the range of the sensor."""
+    clipped = {gap.channel for gap in recording.clipped_gaps}
+    return [channel for channel in MOTION_SENSORS if channel in clipped]
+
+
+def find_clipped_cycles(recording: Recording) -> dict[int, int]:
+    """Return the steps with a sensor of the motion off its range, by the ends of their held cycles.
+
+    Or off it within `CLIPPING_REACH_S` before: filters and the restarted twin remember it. All
+    cycles of such a step count.
+    """
+    gaps = [gap for gap in recording.clipped_gaps if gap.channel in MOTION_SENSORS]
+    reach = round(CLIPPING_REACH_S * recording.start.rate_hz)
+    starts, ends = np.sort([gap.index for gap in gaps]), np.sort([gap.end + reach for gap in gaps])
+
+    def is_clipped(record: Agreement) -> bool:
+        begun = np.searchsorted(starts, record.index, "left")
+        over = np.searchsorted(ends, record.index - record.count, "right")
+        return bool(begun > over)
+
+    records = recording.records(Agreement)
+    steps = {record.step for record in records if is_clipped(record)}
+    return {record.index: record.step for record in records if record.step in steps}
+
+
+def _measure_motion(
+    recording: Recording, profile: Profile
+) -> dict[int, tuple[float, float, float]]:
+    """Return by step the shares of held cycles in contact right and left, and the table's travel.
+
+    The travel is half the range of its displacement in m, the median over the held cycles.
+    """
+    counts: dict[int, Float1D] = {}
+    ranges: dict[int, dict[int, tuple[float, float]]] = {}
+    for block in recording.contiguous_blocks("meas"):
+        contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
+        _add_cycles(counts, ranges, block, contact)
+    return {
+        step: (right / total, left / total, _median_half_range(ranges.get(step, {})))
+        for step, (total, right, left) in counts.items()
+    }
+
+
+def _add_cycles(
+    counts: dict[int, Float1D],
+    ranges: dict[int, dict[int, tuple[float, float]]],
+    block: Block,
+    contact: Iterable[Bool1D],
+) -> None:
+    """Add the held cycles of a block, in place, in one pass: a recording may have thousands.
+
+    `counts` are the samples by step, in all, in contact right and left; `ranges` are the lowest and
+    highest displacement of the table in m by step and cycle.
+    """
+    changes = np.flatnonzero(np.diff(block.step) | np.diff(block.cycle)) + 1
+    starts = np.concatenate([[0], changes])  # of each cycle, and of what lies between
+    lengths = np.diff(starts, append=len(block))
+    sides = [np.add.reduceat(side.astype(np.int64), starts) for side in contact]
+    position = np.full(len(block), np.nan)
+    if "table_disp_m" in block.channels:
+        position = block.channel("table_disp_m")
+        position = np.where(np.isfinite(position), position, np.nan)
+    lows, highs = (extreme.reduceat(position, starts) for extreme in (np.fmin, np.fmax))
+    for k in np.flatnonzero(block.cycle[starts] >= 0).tolist():
+        step, cycle = int(block.step[starts[k]]), int(block.cycle[starts[k]])
+        counts[step] = counts.get(step, 0.0) + np.array([lengths[k], *(side[k] for side in sides)])
+        if np.isfinite(lows[k]):
+            low, high = ranges.setdefault(step, {}).get(cycle, (math.inf, -math.inf))
+            ranges[step][cycle] = min(low, float(lows[k])), max(high, float(highs[k]))
+
+
+def _median_half_range(ranges: Mapping[int, tuple[float, float]]) -> float:
+    """Return half the range of a cycle, the median over cycles; NaN without cycles."""
+    if not ranges:
+        return math.nan
+    return float(np.median([0.5 * (high - low) for low, high in ranges.values()]))
+
+
+def _summarise_step(
+    records: Sequence[Agreement], allowance: Mapping[str, float], noise_rms: Mapping[str, float]
+) -> Json:
+    entry: Json = {}
+    for column, name in enumerate(records[0].channels):
+        known = [
+            record
+            for record in records
+            if math.isfinite(record.error[column]) and record.band[column] > 0
+        ]
+        if not known or name not in CHANNEL_SYMBOLS:
+            continue
+        known.sort(key=lambda record: record.error[column] / record.band[column])
+        median = known[len(known) // 2]
+        phase_errors = [errors[column] for errors in (median.flight, median.right, median.left)]
+        noise = noise_rms.get(name, math.nan)
+        entry[name] = {
+            "error": median.error[column],
+            "band": median.band[column] + allowance[name],
+            "misfit": median.error[column] / noise if noise > 0 else None,
+            "phase": PHASES[int(np.nanargmax(phase_errors))]
+            if np.isfinite(phase_errors).any()
+            else "",
+        }
+    return entry
+
+
+def judge_twin(summary: Mapping[str, Any]) -> Json:
+    """Return the entry `twin_verdict` of a summary, from its other entries alone."""
+    worst = _find_worst(summary)
+    outside = [
+        step for step in summary["steps"] if any(share > 1 for share in _band_shares(step).values())
+    ]
+    grid = sorted({step["frequency_hz"] for step in summary["steps"]})
+    measured, modelled = (
+        (summary.get(f"{prefix}jumps") or [], summary.get(f"{prefix}hysteresis") or [])
+        for prefix in ("", "twin_")
+    )
+    missing = _list_unmatched(modelled[0], *measured, grid)
+    unexpected = _list_unmatched(measured[0], *modelled, grid)
+    warnings = summary.get("warnings") or []
+    is_one_way = len({step["direction"] for step in summary["steps"]}) == 1
+    kinds = (DEPARTURE_KIND, *(JUMP_KINDS if is_one_way else ()))
+    departures = [
+        warning
+        for warning in warnings
+        if warning["kind"] in kinds and not warning.get("is_clipped")
+    ]
+    reasons = []
+    if outside:
+        reasons.append(f"{len(outside)} of {_count_judged(summary)} steps outside the tolerance")
+    elif worst and worst["share"] > 1:
+        reasons.append("the history is outside the tolerance")
+    reasons += [
+        f"{len(items)} {noun}{'s' if len(items) > 1 else ''}"
+        for items, noun in (
+            (missing, "missing jump"),
+            (unexpected, "unexpected jump"),
+            (departures, "warning"),
+        )
+        if items
+    ]
+    judged = _count_judged(summary)
+    is_covered = 2 * judged >= len(summary["steps"])
+    misfit = _overall_misfit(summary)
+    planned, clipped = _count_planned(summary), summary.get("clipped_steps") or ()
+    if (summary.get("run") or {}).get("source") == "model" or worst is None:
+        verdict, reasons = "not judged", [_explain_no_tolerance(summary)]
+    elif not planned and summary.get("clipped_channels"):
+        channels = ", ".join(summary["clipped_channels"])
+        verdict, reasons = "not judged", [f"off the range of their sensor: {channels}"]
+    elif reasons:
+        verdict = "departs"
+    else:
+        verdict = "agrees" if is_covered else "not judged"
+        reasons = ["within the tolerance"] if is_covered else ["too few steps can be judged"]
+        if is_covered and summary["steps"] and summary["verdict"] == "complete":
+            reasons.append("every jump in its place")
+        if _is_remarkable(misfit):
+            reasons.append(f"but u differs by {misfit:.2g} times the noise")
+    if worst and judged < planned:
+        reasons.append(f"{judged} of {planned} steps judged")
+    if worst and clipped:
+        reasons.append(f"{len(clipped)} steps with a sensor off its range")
+    return {
+        "verdict": verdict,
+        "reason": ", ".join(reasons),
+        "tolerance": TOLERANCE_TEXT if planned else HISTORY_TOLERANCE_TEXT,
+        "worst": worst,
+        "steps_outside": len(outside),
+        "steps_judged": judged,
+        "misfit": misfit,
+        "missing_jumps": missing,
+        "unexpected_jumps": unexpected,
+        "warnings": len(warnings),
+        "next_command": _suggest_command(summary, verdict, misfit),
+    }
+
+
+def _band_shares(step: Mapping[str, Any]) -> dict[str, float]:
+    """Return error over band of the judged channels of a step."""
+    agreement = step.get("agreement") or {}
+    return {
+        name: agreement[name]["error"] / agreement[name]["band"]
+        for name in JUDGED_CHANNELS
+        if name in agreement
+    }
+
+
+def _count_judged(summary: Mapping[str, Any]) -> int:
+    return sum(bool(_band_shares(step)) for step in summary["steps"])
+
+
+def _count_planned(summary: Mapping[str, Any]) -> int:
+    """Return the planned steps, without a plan the measured ones; 0 for a history."""
+    return max(summary.get("planned_steps") or 0, len(summary["steps"]))
+
+
+def _explain_no_tolerance(summary: Mapping[str, Any]) -> str:
+    """Return the reason why nothing of a run can be judged."""
+    error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
+    is_compared = (summary.get("run") or {}).get("source") != "model" and error.get("nrmse")
+    if not is_compared or not _count_planned(summary):
+        return NOTHING_MEASURED
+    if len(summary.get("clipped_steps") or ()) == len(summary["steps"]) > 0:
+        return "a sensor was off its range in every step"
+    if error.get("noise_floor"):
+        return "no step has a whole cycle of twin and rig to compare"
+    return "the noise of the sensors is unknown, so no step has a tolerance"
+
+
+def _find_worst(summary: Mapping[str, Any]) -> Json | None:
+    """Return the step and channel, or of a history the channel, with the largest misfit."""
+    places = [
+        (share, step, name)
+        for step in summary["steps"]
+        for name, share in _band_shares(step).items()
+    ]
+    if places:
+        share, step, name = max(places, key=lambda place: place[0])
+        return {
+            "step": step["index"],
+            "direction": step["direction"],
+            "frequency_hz": step["frequency_hz"],
+            "channel": name,
+            "share": share,
+            **step["agreement"][name],
+        }
+    if _count_planned(summary):
+        return None
+    errors = {name: (summary.get("comparison") or {}).get(name) or {} for name in JUDGED_CHANNELS}
+    shares = {
+        name: error["nrmse"] / math.hypot(error.get("noise_floor") or 0.0, AMPLITUDE_TOLERANCE)
+        for name, error in errors.items()
+        if error.get("nrmse") is not None
+    }
+    if not shares:
+        return None
+    name = max(shares, key=lambda channel: shares[channel])
+    floor = errors[name].get("noise_floor")
+    return {
+        "step": None, "direction": None, "frequency_hz": None, "channel": name,
+        "share": shares[name], "error": None, "band": None,
+        "misfit": errors[name]["nrmse"] / floor if floor else None, "phase": "",
+    }  # fmt: skip
+
+
+def _overall_misfit(summary: Mapping[str, Any]) -> float | None:
+    """Return the median over the steps of the misfit of u in multiples of the noise.
+
+    Of a displacement history it is NRMSE over noise floor.
+    """
+    misfits = [
+        entry["misfit"]
+        for step in summary["steps"]
+        if (entry := (step.get("agreement") or {}).get(JUDGED_CHANNELS[0])) and entry["misfit"]
+    ]
+    if misfits:
+        return float(np.median(misfits))
+    error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
+    if error.get("nrmse") is None or not error.get("noise_floor"):
+        return None
+    return float(error["nrmse"] / error["noise_floor"])
+
+
+def _list_unmatched(
+    jumps: Sequence[Json], others: Sequence[Json], intervals: Sequence[Json], grid: Sequence[float]
+) -> list[Json]:
+    """Return the jumps without a counterpart among those of the other source.
+
+    A jump into the last step of the sweep is not judged if the other's hysteresis, `intervals`,
+    reaches that end: the counterpart may lie beyond.
+    """
+
+    def matches(jump: Json, other: Json) -> bool:
+        if (jump["direction"], jump["kind"]) != (other["direction"], other["kind"]):
+            return False
+        steps = abs(_grid_index(grid, jump["to_hz"]) - _grid_index(grid, other["to_hz"]))
+        distance_hz = abs(jump["to_hz"] - other["to_hz"])
+        return steps <= 1 or distance_hz <= JUMP_TOLERANCE * jump["to_hz"]
+
+    def leaves_range(jump: Json) -> bool:
+        end = grid[-1] if jump["direction"] == "forward" else grid[0]
+        reached = any(end in (entry["from_hz"], entry["to_hz"]) for entry in intervals)
+        return bool(jump["to_hz"] == end and reached)
+
+    return [
+        jump
+        for jump in jumps
+        if not leaves_range(jump) and not any(matches(jump, other) for other in others)
+    ]
+
+
+def _grid_index(grid: Sequence[float], frequency_hz: float) -> int:
+    return int(np.argmin(np.abs(np.array(grid) - frequency_hz)))
+
+
+def _is_remarkable(misfit: float | None) -> bool:
+    return misfit is not None and misfit > MAX_UNREMARKABLE_MISFIT
+
+
+def _suggest_command(summary: Mapping[str, Any], verdict: str, misfit: float | None) -> str:
+    """Return the command to type next; DIR stands for the folder of the run."""
+    if summary["verdict"] != "complete":
+        return "shaketwin verify DIR"
+    if verdict == "departs" and any(
+        warning["kind"] == "instrument" for warning in summary.get("warnings") or ()
+    ):
+        return "shaketwin identify DIR"  # judges the instruments too
+    if verdict == "departs" or (verdict == "agrees" and _is_remarkable(misfit)):
+        return "shaketwin discover DIR"
+    return "shaketwin view DIR"
+
+
+def format_twin_verdict(verdict: Mapping[str, Any], folder: Path) -> list[str]:
+    """Return the lines of a verdict for the console: verdict, worst place, jumps, next command."""
+    lines = [f"twin {verdict['verdict']}: {verdict['reason']}"]
+    if worst := verdict["worst"]:
+        lines.append(f"worst: {describe_worst(worst)}; tolerance {verdict['tolerance']}")
+    for name in ("missing", "unexpected"):
+        lines += [f"{name}: {format_jump(jump)}" for jump in verdict[f"{name}_jumps"]]
+    return [*lines, f"next: {name_command(verdict, folder)}"]
+
+
+def name_command(verdict: Mapping[str, Any], folder: Path) -> str:
+    """Return the next command with the folder of the run in place of DIR."""
+    return str(verdict["next_command"]).replace("DIR", shlex.quote(str(folder)))
+
+
+def describe_worst(worst: Mapping[str, Any]) -> str:
+    """Describe the worst place of a verdict: where, by how much, in multiples of the noise."""
+    symbol, unit = CHANNEL_SYMBOLS[worst["channel"]]
+    parts = []
+    if worst["step"] is not None:
+        parts.append(f"{worst['frequency_hz']:g} Hz {worst['direction']}, step {worst['step'] + 1}")
+    phase = str(worst["phase"]).replace("_", " ")
+    parts.append(f"{symbol} {f'in {phase}' if phase else ''}".strip())
+    if worst["error"] is not None:
+        parts.append(f"misfit {format_quantity(worst['error'], unit)} rms")
+    if worst["misfit"] is not None:
+        parts.append(f"{worst['misfit']:.3g} times the noise")
+    return ", ".join([*parts, f"{worst['share']:.2g} times the tolerance"])
+
+
+def format_jump(jump: Mapping[str, Any]) -> str:
+    """Format a jump as direction, kind and the grid frequencies that it lies between."""
+    return f"{jump['direction']} jump {jump['kind']}, {jump['from_hz']:g} to {jump['to_hz']:g} Hz"

@@ -1,0 +1,1 @@
+"""Commands of the rig: pre-flight, wiring, calibration, devices, simulated tables."""

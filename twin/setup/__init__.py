@@ -1,0 +1,1 @@
+"""A run before it starts: configuration, plans of measured branches, folder, disk, pace."""

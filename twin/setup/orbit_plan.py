@@ -1,0 +1,341 @@
+"""Orbit plan of a continuation or a backbone: orbits with Jacobian and feedback gains.
+
+Everything that the rig needs of the model is computed here, before the table moves, and refused
+here if it cannot be done: no unstable orbit or no phase resonance in the range, or a latency at
+which no gains hold them.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.backends import open_backend
+from table_io.block import Float1D
+from table_io.clock import ManualClock
+from table_io.config.excitation.backbone import Backbone
+from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.errors import InputError
+from table_io.sequencer import FEEDBACK_HORIZON_S, make_test_plan
+from table_io.units import GRAVITY_M_S2
+from twin.dynamics.arclength import NoConvergence, correct, weighted_length
+from twin.dynamics.continuation import Branch, continue_branch, make_problem, orbit_weights
+from twin.dynamics.linearized_orbit import LinearizedOrbit, find_harmonics
+from twin.dynamics.orbits import Orbit, settle_to_orbit
+from twin.dynamics.period_map import FREQUENCY, PeriodMap, make_period_map
+from twin.model.model import Model
+from twin.setup.feedback_gains import FeedbackTiming, interpolate_gains
+from twin.setup.phase_resonance import find_phase_resonance, find_resonance_approach
+
+RANGE_MARGIN = 1.2  # ratio of frequencies by which the branch is followed beyond the range
+REFUSAL_MARGIN = 1.6  # the same, to tell where unstable orbits are
+LEAD_ORBITS = 3  # stable ones before and after the unstable ones
+PLAN_HARMONICS = 9
+MODEL_ERROR = 0.05  # relative error of mass and of stiffness with which the gains must hold
+JITTER_S = 0.005  # of blocks that arrive late; the feedback horizon absorbs smaller ones
+PLAN_FILE = "orbit_plan.json"
+FINE_POSITIONS = 2001  # at which the range is looked for along the unstable part
+MIN_UNSTABLE_POINTS = 3  # of a followed branch, between its folds
+
+
+@dataclass(frozen=True, eq=False)
+class UnstableStretch:
+    """Unstable orbits of a branch in order, with the stable ones before and after them.
+
+    positions (orbit,): distance along the branch, 0 and 1 at the ends of the unstable part; lengths
+    in frequency and in amplitude count alike.
+    """
+
+    orbits: tuple[Orbit, ...]
+    positions: Float1D
+
+    def divide(self, range_hz: tuple[float, float], points: int) -> list[float]:
+        """Return positions of unstable orbits in a range, evenly spaced, and of stable ones.
+
+        The stable ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds.
+        """
+        frequencies = np.array([orbit.frequency_hz for orbit in self.orbits])
+        fine = np.linspace(0.0, 1.0, FINE_POSITIONS)
+        fine_hz = np.interp(fine, self.positions, frequencies)
+        inside = fine[(fine_hz >= range_hz[0]) & (fine_hz <= range_hz[1])]
+        low, high = float(inside[0]), float(inside[-1])
+        numbers = np.arange(-LEAD_ORBITS, points + LEAD_ORBITS) + 0.5
+        positions = low + numbers / points * (high - low)
+        first = self.positions[0] if low == 0.0 else low
+        last = self.positions[-1] if high == 1.0 else high
+        return [float(p) for p in positions if first <= p <= last]
+
+    def orbit_at(self, position: float) -> Orbit:
+        """Return the orbit at a position by Newton's method."""
+        last = len(self.orbits) - 2
+        index = int(np.clip(np.searchsorted(self.positions, position) - 1, 0, last))
+        first, second = self.orbits[index], self.orbits[index + 1]
+        span = self.positions[index + 1] - self.positions[index]
+        z0, z1 = (np.append(orbit.x, orbit.frequency_hz) for orbit in (first, second))
+        weights = np.append(orbit_weights(first), 1.0)
+        guess = z0 + (position - self.positions[index]) / span * (z1 - z0)
+        problem = make_problem(first, FREQUENCY)
+        length = weighted_length(z1 - z0, weights)
+        try:
+            point = correct(problem.evaluate, guess, (z1 - z0) / length, weights, length)
+        except NoConvergence:  # between orbits of different contacts
+            return first if position - self.positions[index] < span / 2 else second
+        return problem.make_orbit(point.z, point.linearization.result)
+
+
+def make_orbit_plan(
+    model: Model,
+    range_hz: tuple[float, float],
+    acceleration_m_s2: float,
+    points: int,
+    timing: FeedbackTiming,
+) -> OrbitPlan:
+    """Return the plan of a continuation through the unstable orbits of a model in a range.
+
+    `points` unstable orbits, evenly spaced along the branch, and LEAD_ORBITS stable ones on either
+    side. InputError if there are none, or if the latency is too large, with the largest allowed.
+    """
+    period_map = make_period_map(model)
+    stretch = find_unstable_stretch(period_map, range_hz, acceleration_m_s2)
+    variants = _find_variants(period_map, range_hz, acceleration_m_s2)
+    positions = stretch.divide(range_hz, points)
+    orbits = [stretch.orbit_at(position) for position in positions]
+
+    def list_orbits(station: int) -> list[Orbit]:
+        return [source.orbit_at(positions[station]) for source in (stretch, *variants)]
+
+    gains = interpolate_gains(list_orbits, positions, timing)
+    return OrbitPlan(
+        harmonics=PLAN_HARMONICS,
+        latency_s=timing.latency_s,
+        jitter_s=timing.jitter_s,
+        points=tuple(_plan_orbit(orbit, own) for orbit, own in zip(orbits, gains, strict=True)),
+    )
+
+
+def _plan_orbit(orbit: Orbit, gains: tuple[float, float]) -> PlannedOrbit:
+    multiplier = complex(orbit.multipliers[0])
+    harmonics = find_harmonics(orbit, PLAN_HARMONICS)
+    return PlannedOrbit(
+        frequency_hz=orbit.frequency_hz,
+        acceleration_m_s2=orbit.acceleration_m_s2,
+        stable=orbit.stable,
+        multiplier=(multiplier.real, multiplier.imag) if multiplier.imag else multiplier.real,
+        u_m=tuple((value.real, value.imag) for value in harmonics.tolist()),
+        jacobian=tuple(
+            tuple(row) for row in LinearizedOrbit(orbit, 1).table_jacobian(PLAN_HARMONICS).tolist()
+        ),
+        gain=gains[0],
+        rate_gain_s=gains[1],
+    )
+
+
+def find_unstable_stretch(
+    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
+) -> UnstableStretch:
+    """Return the longest unstable part between folds in a frequency range, with its surroundings.
+
+    The branch is that of the orbit to which rest settles above the range. InputError without one.
+    """
+    low_hz, high_hz = range_hz[0] / RANGE_MARGIN, range_hz[1] * RANGE_MARGIN
+    start = settle_to_orbit(period_map, high_hz, acceleration_m_s2)
+    if start is None:
+        raise InputError(
+            f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz",
+            key="excitation.stop_hz",
+            value=range_hz[1],
+            remedy="choose another range",
+        )
+    branch = continue_branch(start, FREQUENCY, (low_hz, high_hz))
+    stretches = [
+        stretch
+        for stretch in _split_unstable(branch)
+        if any(
+            not orbit.stable and range_hz[0] <= orbit.frequency_hz <= range_hz[1]
+            for orbit in stretch.orbits
+        )
+    ]
+    if not stretches:
+        lower_hz = range_hz[0] / REFUSAL_MARGIN
+        raise _make_refusal(continue_branch(start, FREQUENCY, (lower_hz, high_hz)), range_hz)
+    return max(stretches, key=lambda stretch: sum(not orbit.stable for orbit in stretch.orbits))
+
+
+def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
+    """Return the error that the range has no unstable orbit, with what the branch has."""
+    inside = [
+        abs(point.orbit.multipliers[0])
+        for point in branch.points
+        if range_hz[0] <= point.value <= range_hz[1]
+    ]
+    others = [
+        orbit.frequency_hz
+        for stretch in _split_unstable(branch)
+        for orbit in stretch.orbits
+        if not orbit.stable
+    ]
+    largest = f" (largest multiplier {max(inside):.4g})" if inside else ""
+    return InputError(
+        f"the model has no unstable orbit between folds from {range_hz[0]:g} to {range_hz[1]:g} "
+        f"Hz{largest}",
+        key="excitation.start_hz",
+        value=range_hz[0],
+        allowed=f"a range within {min(others):.4g} to {max(others):.4g} Hz" if others else "",
+        remedy="choose another range, level or model",
+    )
+
+
+def _split_unstable(branch: Branch) -> list[UnstableStretch]:
+    """Return the unstable parts between folds, each with the branch before and after it."""
+    orbits = tuple(point.orbit for point in branch.points)
+    is_unstable = [
+        bool(((orbit.multipliers.imag == 0) & (orbit.multipliers.real > 1)).any())
+        for orbit in orbits
+    ]
+    edges = np.flatnonzero(np.diff(is_unstable, prepend=False, append=False)).reshape(-1, 2)
+    frequencies = np.array([orbit.frequency_hz for orbit in orbits])
+    amplitudes = np.array([orbit.u_max - orbit.u_min for orbit in orbits])
+    stretches = []
+    for first, end in edges.tolist():
+        if end - first < MIN_UNSTABLE_POINTS:
+            continue
+        scales = [float(np.ptp(values[first:end])) or 1.0 for values in (frequencies, amplitudes)]
+        steps = np.hypot(np.diff(frequencies) / scales[0], np.diff(amplitudes) / scales[1])
+        distance = np.append(0.0, np.cumsum(steps))
+        positions = (distance - distance[first]) / (distance[end - 1] - distance[first])
+        positions, indices = np.unique(positions, return_index=True)
+        stretch = UnstableStretch(tuple(orbits[index] for index in indices), positions)
+        rises = frequencies[end - 1] > frequencies[first]
+        stretches.append(stretch if rises else _reverse(stretch))
+    return stretches
+
+
+def _reverse(stretch: UnstableStretch) -> UnstableStretch:
+    """Return the stretch from its other end: towards higher frequencies."""
+    return UnstableStretch(stretch.orbits[::-1], 1.0 - stretch.positions[::-1])
+
+
+def _vary_parameters(period_map: PeriodMap) -> list[PeriodMap]:
+    """Return models with errors of mass and stiffness."""
+    return [
+        period_map.with_parameter(name, factor * period_map.parameter(name))
+        for name in ("mass", "stiffness")
+        for factor in (1.0 - MODEL_ERROR, 1.0 + MODEL_ERROR)
+    ]
+
+
+def _find_variants(
+    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
+) -> list[UnstableStretch]:
+    """Return the unstable parts of models with errors of mass and stiffness, where they exist."""
+    variants = []
+    for varied in _vary_parameters(period_map):
+        try:
+            variants.append(find_unstable_stretch(varied, range_hz, acceleration_m_s2))
+        except InputError:
+            continue
+    return variants
+
+
+def make_backbone_plan(
+    model: Model, range_hz: tuple[float, float], levels_m_s2: Float1D, timing: FeedbackTiming
+) -> OrbitPlan:
+    """Return the plan of a backbone: the orbit in phase resonance at each level, (level,) in m/s2.
+
+    InputError if a level has none in the range, or if the latency is too large.
+    """
+    period_map = make_period_map(model)
+    *leads, first = find_resonance_approach(period_map, range_hz, float(levels_m_s2[0]))
+    orbits = [first] + [
+        find_phase_resonance(period_map, range_hz, level) for level in levels_m_s2[1:].tolist()
+    ]
+    variants = _vary_parameters(period_map)
+
+    def list_orbits(station: int) -> list[Orbit]:
+        listed = [orbits[station]]
+        for variant in variants:
+            try:
+                listed.append(find_phase_resonance(variant, range_hz, float(levels_m_s2[station])))
+            except InputError:  # beyond the range
+                continue
+        return listed
+
+    gains = interpolate_gains(list_orbits, np.log(levels_m_s2).tolist(), timing)
+    return OrbitPlan(
+        condition="phase",
+        harmonics=PLAN_HARMONICS,
+        latency_s=timing.latency_s,
+        jitter_s=timing.jitter_s,
+        points=tuple(_plan_orbit(orbit, own) for orbit, own in zip(orbits, gains, strict=True)),
+        leads=tuple(_plan_orbit(orbit, gains[0]) for orbit in leads),
+    )
+
+
+def attach_orbit_plan(text: str, profile: Profile, rig: RigConfig, model: Model, where: str) -> str:
+    """Return the text of a continuation profile with the orbit plan of the model attached.
+
+    InputError as in `make_orbit_plan`, or if the rig cannot replace its queued command.
+    """
+    config = profile.continuation
+    assert config is not None
+    timing = find_timing(profile, rig)
+    _attach_file(text, "", where)  # refuses before the plan is computed
+    range_hz = (config.start_hz, config.stop_hz)
+    largest = config.acceleration_g * GRAVITY_M_S2
+    if isinstance(config, Backbone):
+        smallest = config.min_acceleration_g * GRAVITY_M_S2
+        levels = np.geomspace(smallest, largest, config.points) if config.points > 1 else [largest]
+        plan = make_backbone_plan(model, range_hz, np.array(levels), timing)
+    else:
+        plan = make_orbit_plan(model, range_hz, largest, config.points, timing)
+    return _attach_file(text, plan.to_json(), where)
+
+
+def _attach_file(text: str, content: str, where: str) -> str:
+    """Return the text of a profile with the content of its orbit plan; InputError if impossible."""
+    named = re.sub(
+        r"^[ \t]*\[excitation\].*$", rf'\g<0>\nfile = "{PLAN_FILE}"', text, count=1, flags=re.M
+    )
+    attached = f"{named}\n[excitation.files]\n\"{PLAN_FILE}\" = '''\n{content}'''\n"
+    try:
+        if tomllib.loads(attached)["excitation"]["file"] == PLAN_FILE:
+            return attached
+    except (tomllib.TOMLDecodeError, KeyError):
+        pass
+    raise InputError(
+        "its orbit plan cannot be attached",
+        where=where,
+        key="excitation",
+        remedy="write it as a table, [excitation]",
+    )
+
+
+def check_orbit_plan(profile: Profile, rig: RigConfig) -> None:
+    """Raise InputError if a rig answers later than the orbit plan that a profile brings allows."""
+    make_test_plan(profile, rig, _find_replace_after(profile, rig))
+
+
+def find_timing(profile: Profile, rig: RigConfig) -> FeedbackTiming:
+    """Return the timing of the feedback on a rig; InputError if it cannot replace its command."""
+    config = profile.continuation
+    assert config is not None
+    rate_hz = profile.acquisition.rate_hz
+    horizon_s = _find_replace_after(profile, rig) / rate_hz + FEEDBACK_HORIZON_S
+    latency_s = horizon_s + 1e-3 * config.table_lag_ms
+    return FeedbackTiming(latency_s, JITTER_S, profile.acquisition.block_samples / rate_hz)
+
+
+def _find_replace_after(profile: Profile, rig: RigConfig) -> int:
+    """Return how many samples ahead a rig can change its command; InputError if it cannot."""
+    if rig.under_external_control:
+        raise InputError(
+            "another controller drives this table: there is no queued command to replace",
+            where=f"rig {rig.name}",
+            key="backend",
+            value=rig.backend,
+            remedy="use a rig whose backend drives the table",
+        )
+    return open_backend(rig, profile, ManualClock()).replace_after

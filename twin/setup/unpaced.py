@@ -1,0 +1,124 @@
+"""Runs in one process, without real time: `--speed max` and `simulate`."""
+
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from table_io.acquisition.session import OperatorCommand, run_session
+from table_io.backends import open_backend
+from table_io.block import Block
+from table_io.clock import ManualClock
+from table_io.records import (
+    Record,
+    RunStart,
+    RunStop,
+    StepAdded,
+)
+from twin.compare import pipeline
+from twin.recording.mcap_log import LogWriter
+from twin.setup.realtime import check_full_speed
+from twin.setup.run_config import RunConfig
+from twin.transport.codec import Item, encode_item, topic_for
+
+ItemHandler = Callable[[Item], None]
+PayloadHandler = Callable[[Item, bytes], None]
+FLUSH_INTERVAL_S = 5.0  # of recorded time
+SIMULATED_BLOCK_SAMPLES = 500
+
+
+def record_items(
+    items: Iterator[Item],
+    path: Path,
+    run: str,
+    rate_hz: float,
+    on_item: ItemHandler,
+    on_payload: PayloadHandler = lambda *_: None,
+) -> None:
+    """Write every item to a new log at `path`; the log is closed on errors too.
+
+    `on_payload` is called with each recorded item and its payload before writing, `on_item` with
+    each item after.
+    """
+    writer = LogWriter(path, rate_hz)
+    flushed_index = 0
+    try:
+        for item in items:
+            if isinstance(item, RunStart):
+                writer.write_run_description(item)
+            for part in writer.select_recorded(item):
+                payload = encode_item(part, run)
+                on_payload(part, payload)
+                writer.write(topic_for(part), payload, part.index)
+            if item.index - flushed_index > FLUSH_INTERVAL_S * rate_hz:
+                writer.flush()
+                flushed_index = item.index
+            on_item(item)
+    finally:
+        writer.close()
+
+
+def add_twin_items(
+    source: Iterator[Block | Record], setup: pipeline.PipelineSetup
+) -> Iterator[Item]:
+    """Yield every item of a source, each followed by the twin's output for it."""
+    state = None
+    for item in source:
+        yield item
+        if isinstance(item, StepAdded):
+            setup = pipeline.add_steps(setup, item)
+        elif isinstance(item, RunStart):
+            state, begun = pipeline.start_pipeline(setup)
+            yield from begun
+        elif isinstance(item, Block) and state is not None:
+            state, items = pipeline.step(setup, state, item)
+            yield from items
+
+
+def play_unpaced(
+    config: RunConfig,
+    run: str,
+    path: Path,
+    poll_interrupt: Callable[[], str | None],
+    on_item: ItemHandler,
+) -> None:
+    """Run the test on a simulated table at full speed, recorded to `path`."""
+    check_full_speed(config.rig)
+    clock = ManualClock()
+    backend = open_backend(config.rig, config.profile, clock)
+
+    def poll_command() -> OperatorCommand | None:
+        return OperatorCommand("stop", why) if (why := poll_interrupt()) else None
+
+    source = run_session(
+        config.session_setup, backend, clock, config.make_start_factory(run, "table"), poll_command
+    )
+    record_items(
+        add_twin_items(source, config.prepare_twin()), path, run, config.drive.rate_hz, on_item
+    )
+
+
+def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler) -> None:
+    """Simulate the model on the ideal drive, without table and noise, recorded to `path`."""
+    record_items(generate_ideal_twin(config, run), path, run, config.drive.rate_hz, on_item)
+
+
+def generate_ideal_twin(config: RunConfig, run: str = "") -> Iterator[Item]:
+    """Yield the items of an ideal table, each followed by the twin's items for it."""
+    return add_twin_items(_generate_ideal(config, run), config.prepare_twin(from_rest=True))
+
+
+def _generate_ideal(config: RunConfig, run: str) -> Iterator[Item]:
+    """Yield the items of an ideal table, which follows the drive exactly."""
+    drive = config.ideal_drive
+    start = config.make_start_factory(run, "model")({}, 0.0)
+    yield start
+    end = drive.planned_end + math.ceil(config.profile.acquisition.rest_s * drive.rate_hz)
+    for first in range(0, end, SIMULATED_BLOCK_SAMPLES):
+        count = min(SIMULATED_BLOCK_SAMPLES, end - first)
+        command = drive.command(first, count)
+        values = np.array([command, command, drive.acceleration(first, count)])
+        labels = drive.labels(first, count)
+        yield Block("meas", first, drive.rate_hz, start.channels, values, *labels)
+    yield RunStop(end, "complete", "the whole drive was played", ("idle", "running", "at rest"))

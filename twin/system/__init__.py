@@ -1,0 +1,1 @@
+"""What everything stands on: terminal, files, versions, process pool, limits."""

@@ -1,0 +1,232 @@
+"""Independent numbered tasks in local processes or threads, or on the workers of a Dask cluster.
+
+Results are yielded as they are completed. A task is a module-level function of its number, or a
+`functools.partial` of one: it is pickled. What it computes may depend on the number only, so that
+any number of workers gives the same results; what is large it writes to a file itself. Threads are
+for short tasks in kernels that release the GIL: they start at once and share what is compiled.
+"""
+
+import multiprocessing
+import os
+import signal
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from itertools import islice
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+from table_io.errors import InputError
+from twin.system.files import count_cores
+
+TERMINAL_SIGNALS = ("SIGINT", "SIGHUP", "SIGQUIT")
+MAX_TASK_S = 900.0  # time limit of a task in a local process, which is then terminated
+Task = Callable[[int], Any]
+StopFunction = Callable[[], object]
+
+
+def find_no_problem() -> str:
+    """Accept every worker."""
+    return ""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskResult:
+    """What the task of a number returned, or why it returned nothing."""
+
+    number: int
+    value: Any = None
+    failure: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """Where tasks run: `count` local processes or threads, or the cluster of a Dask scheduler."""
+
+    count: int
+    scheduler: str = ""
+    in_threads: bool = False
+
+    def require(self) -> None:
+        """Raise InputError if a cluster does not answer, or its workers have other versions."""
+        if self.scheduler:
+            from twin.system.dask_cluster import require_cluster
+
+            require_cluster(self.scheduler)
+
+    @classmethod
+    def from_options(
+        cls, workers: int | None, scheduler: str = "", in_threads: bool = False
+    ) -> "Workers":
+        """Return the workers of `--workers` and `--scheduler`; by default one per core."""
+        if workers is not None and workers < 1:
+            raise InputError(
+                "invalid number of workers",
+                key="--workers",
+                value=workers,
+                allowed="1 or more",
+                remedy="omit --workers to use all cores",
+            )
+        if workers is not None and scheduler:
+            raise InputError(
+                "a cluster has its own number of workers",
+                key="--workers",
+                value=workers,
+                remedy="omit --workers, or --scheduler to compute on this machine",
+            )
+        return cls(workers or count_cores(), scheduler, in_threads)
+
+    def __str__(self) -> str:
+        if self.scheduler:
+            return f"the cluster of {self.scheduler}"
+        unit, plural = ("thread", "s") if self.in_threads else ("process", "es")
+        return f"{self.count} {unit}{plural if self.count > 1 else ''}"
+
+
+def run_tasks(
+    task: Task,
+    numbers: Iterable[int],
+    workers: Workers,
+    stop: StopFunction = lambda: False,
+    *,
+    max_task_s: float = MAX_TASK_S,
+    attempts: int = 1,
+    find_problem: Callable[[], str] = find_no_problem,
+) -> Iterator[TaskResult]:
+    """Yield the result of the task of every number, in the order of completion.
+
+    After `stop()` is true no task is started; those in progress are completed and yielded. A task
+    whose process dies is started again until it has had `attempts`. Only a process has a
+    `max_task_s`: a task that does not end on a cluster must be stopped by its operator, and what a
+    task raises in a thread is raised here. `find_problem` runs on every
+    worker of a cluster before anything starts and returns why it cannot be used, "" if it can.
+    InputError if the cluster cannot be used, or is lost.
+    """
+    if workers.scheduler:
+        from twin.system.dask_cluster import run_on_cluster
+
+        return run_on_cluster(workers.scheduler, task, numbers, stop, attempts, find_problem)
+    if workers.in_threads:
+        return _run_in_threads(task, numbers, workers.count, stop)
+    return _run_in_processes(task, numbers, workers.count, stop, max_task_s, attempts)
+
+
+def order_results(results: Iterable[TaskResult]) -> Iterator[TaskResult]:
+    """Yield the results of the tasks 0, 1, ... in this order, each as soon as it is next."""
+    completed: dict[int, TaskResult] = {}
+    following = 0
+    for result in results:
+        completed[result.number] = result
+        while following in completed:
+            yield completed.pop(following)
+            following += 1
+
+
+def _run_in_threads(
+    task: Task, numbers: Iterable[int], count: int, stop: StopFunction
+) -> Iterator[TaskResult]:
+    pending = iter(numbers)
+    running: dict[Future[Any], int] = {}
+    with ThreadPoolExecutor(count) as threads:
+        while True:
+            for number in () if stop() else islice(pending, count - len(running)):
+                running[threads.submit(task, number)] = number
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                yield TaskResult(running.pop(future), future.result())
+
+
+def _run_in_processes(
+    task: Task,
+    numbers: Iterable[int],
+    count: int,
+    stop: StopFunction,
+    max_task_s: float,
+    attempts: int,
+) -> Iterator[TaskResult]:
+    os.environ |= {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    pending = iter(numbers)
+    repeated: deque[int] = deque()
+    failures = Counter[int]()  # of each number
+    running: dict[Future[TaskResult], _WorkerProcess] = {}
+
+    def start_next(worker: _WorkerProcess | None) -> bool:
+        number = None if stop() else repeated.popleft() if repeated else next(pending, None)
+        if number is None:
+            return False
+        if worker is None or not worker.process.is_alive():
+            worker = _start_worker(task)
+        running[threads.submit(worker.run, number, max_task_s)] = worker
+        return True
+
+    # One thread waits for each process. A ProcessPoolExecutor loses the tasks of all processes with
+    # one, cannot end a task that takes too long, and outlives this process if that is killed.
+    with ThreadPoolExecutor(count) as threads:
+        try:
+            while len(running) < count and start_next(None):
+                pass
+            while running:
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    worker, result = running.pop(future), future.result()
+                    failures[result.number] += bool(result.failure)
+                    is_final = not result.failure or failures[result.number] >= attempts
+                    if not is_final:
+                        repeated.append(result.number)
+                    if not start_next(worker):
+                        worker.pipe.close()
+                        worker.process.join()
+                    if is_final:
+                        yield result
+        finally:
+            for worker in running.values():
+                worker.process.terminate()
+
+
+@dataclass(frozen=True, slots=True)
+class _WorkerProcess:
+    """A process that runs one task after another, until its pipe is closed."""
+
+    process: BaseProcess
+    pipe: Connection
+
+    def run(self, number: int, max_task_s: float) -> TaskResult:
+        """Return the result of a task, or the reason why there is none."""
+        try:
+            self.pipe.send(number)
+            if self.pipe.poll(max_task_s):
+                return TaskResult(number, self.pipe.recv())
+            self.process.terminate()
+            reason = f"took longer than {max_task_s:g} s"
+            self.process.join()
+        except (EOFError, OSError):
+            self.process.join()
+            reason = f"its process died (exit code {self.process.exitcode})"
+        return TaskResult(number, failure=reason)
+
+
+def _start_worker(task: Task) -> _WorkerProcess:
+    """Start a process without a task."""
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe()
+    process = context.Process(target=_serve_tasks, args=(theirs, task), daemon=True)
+    process.start()
+    theirs.close()  # so that the death of the process closes the pipe
+    return _WorkerProcess(process, ours)
+
+
+def _serve_tasks(pipe: Connection, task: Task) -> None:
+    """Run tasks by the numbers from a pipe until it is closed; main function of a worker process.
+
+    Ctrl-C and the end of a terminal reach all its processes; only the parent process handles them.
+    """
+    for name in TERMINAL_SIGNALS:
+        if hasattr(signal, name):  # Windows has the first alone
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    try:
+        while True:
+            pipe.send(task(pipe.recv()))
+    except (EOFError, OSError):
+        return

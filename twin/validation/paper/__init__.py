@@ -1,1 +1,0 @@
-"""Reproduction of Stefani, De Angelis, Andreaus: every figure, and a table of comparisons."""
