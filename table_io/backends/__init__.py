@@ -44,20 +44,63 @@ waits. If the rig was only slow, its next call raises MachineLost.
 A module makes a backend known by a `BackendDescriptor`, registered under the backend's name in the
 entry-point group `shaketwin.backends`. What differs between backends is stated there; nothing else
 asks which backend a rig has.
+
+Digital inputs of a rig: the heartbeat wired back, limit switches, interlock.
+
+Only the wiring check reads them, next to the backend; no run depends on them.
+
+Result of device discovery, in the same form for every vendor.
+
+A `DeviceSearch` returns a tuple of `DiscoveredDevice`. It raises InputError if it cannot search: a
+library is not installed (the message has the pip line) or a server does not answer.
 """
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
-from table_io.backends.digital_inputs import DigitalInputs
-from table_io.backends.discovery import DeviceSearch
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.backend import BackendConfig, require_backend
 from table_io.config.profile import Profile, Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+
+
+class DigitalInputs(Protocol):
+    """Digital inputs, open until `close`."""
+
+    def read_levels(self) -> dict[str, bool]:
+        """Return the present level of each input, by name."""
+
+    def close(self) -> None:
+        """Release the inputs."""
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelGroup:
+    """Channels of one kind on a device, with ranges in V and the highest sample rate in Hz."""
+
+    kind: Literal["AI", "AO", "DI", "DO"]
+    names: tuple[str, ...]  # as written in the rig file
+    ranges_v: tuple[tuple[float, float], ...] = ()  # (low, high) in V; empty: unknown
+    most_hz: float | None = None  # highest sample rate of one channel
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoveredDevice:
+    """One device that answered, and its channels."""
+
+    kind: str  # name of its backend
+    name: str  # as written in the rig file: Dev1, daq.nd://...
+    where: str  # address of its server, or "local driver"
+    product: str = ""
+    serial: str = ""
+    simulated: bool = False
+    ports: tuple[ChannelGroup, ...] = ()
+
+
+DeviceSearch = Callable[[], tuple[DiscoveredDevice, ...]]
 
 SAMPLE_TIMEOUT_S = 0.5  # after its scheduled time a missing sample counts as lost
 HEARTBEAT_TIMEOUT_S = 0.3  # silence after which the machine's watchdog assumes a dead rig

@@ -1,6 +1,10 @@
-"""Section `[simulated]` of a rig file: the simulated table, its specimen and injected faults."""
+"""Section `[simulated]` of a rig file: the simulated table, its specimen and injected faults.
 
-from typing import Literal, NamedTuple
+`hydraulic_table.py` states the equations of `[simulated.hydraulic]`.
+"""
+
+import math
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
@@ -9,7 +13,136 @@ from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, suggest
 from table_io.sim.ground_truth import GroundTruth
-from table_io.sim.hydraulic_config import HydraulicTableConfig
+
+Percent = Annotated[float, Field(ge=0.0, le=20.0)]
+Share = Annotated[float, Field(gt=-0.9, lt=0.9)]
+Slope = Annotated[float, Field(ge=-1000.0, le=1000.0)]
+# Time constants that the sub-step of the integrator, 32 us, still resolves.
+MIN_TRANSDUCER_LAG_MS, MAX_FREQUENCY_HZ = 0.2, 1000.0
+
+
+class HydraulicTableConfig(ConfigModel):
+    """Servo valve, actuator, friction, controller and frame of a hydraulic table."""
+
+    piston_area_cm2: Positive = Field(description="Effective area of the piston, A.")
+    oil_volume_cm3: Positive = Field(description="Oil under pressure in both chambers, V.")
+    bulk_modulus_mpa: Positive = Field(description="Effective bulk modulus of the oil, B.")
+    supply_pressure_mpa: Positive = Field(description="Supply above the return, P.")
+    leakage_l_min_mpa: NonNegative = Field(description="Leakage across the piston, L.")
+    rated_flow_l_min: Positive = Field(
+        description="Flow of the open valve, Q_r, at the drop below."
+    )
+    rated_drop_mpa: Positive = Field(7.0, description="Pressure drop of the rated flow, P_r.")
+    valve_frequency_hz: Positive = Field(description="Natural frequency of the spool; -90 degrees.")
+    valve_damping: Positive = Field(description="Damping ratio of the spool, z.")
+    friction_n: NonNegative = Field(description="Friction in motion, F_c.")
+    static_friction_n: NonNegative = Field(description="Friction that must be overcome, F_s.")
+    stribeck_speed_m_s: Positive = Field(0.01, description="Speed of the fall to F_c, v_s.")
+    stick_stiffness_n_m: Positive = Field(2.5e7, description="Stiffness while it sticks, s0.")
+    stick_damping_n_s_m: NonNegative = Field(2.0e4, description="Damping while it sticks, s1.")
+    viscous_friction_n_s_m: NonNegative = Field(description="Viscous friction, c.")
+    gain_1_s: Positive = Field(description="Gain of the stroke loop: speed over error, k.")
+    velocity_feedforward: NonNegative = Field(
+        description="Feed-forward of the command's speed, k_ff; 1 in full."
+    )
+    pressure_feedback: NonNegative = Field(
+        description="Valve opening that the supply pressure takes back as load pressure, k_p."
+    )
+    pressure_corner_hz: Positive = Field(
+        1.0, description="Below it the load pressure is not fed back, 1 / (2 pi t_p)."
+    )
+    frame_mass_kg: Positive = Field(description="Mass of the frame that bears the actuator, m_f.")
+    frame_frequency_hz: Positive = Field(description="Its natural frequency, w_f / (2 pi).")
+    frame_damping: NonNegative = Field(description="Its damping ratio, z_f.")
+    valve_overlap_percent: Percent = Field(
+        0.0, description="Overlap of the spool on either side, of its travel; no flow within it."
+    )
+    valve_hysteresis_percent: Percent = Field(
+        0.0, description="Width of the valve's hysteresis loop, of its travel."
+    )
+    flow_asymmetry: Share = Field(
+        0.0, description="Flow gain more in the positive direction, and less in the negative."
+    )
+    friction_asymmetry: Share = Field(
+        0.0, description="Friction more in the positive direction, and less in the negative."
+    )
+    friction_slope_1_m: Slope = Field(
+        0.0, description="Relative rise of the friction along the stroke, at its centre."
+    )
+    coupling_play_mm: NonNegative = Field(
+        0.0, description="Play between piston and table, from stop to stop."
+    )
+    coupling_stiffness_n_m: Positive = Field(
+        2e8, description="Stiffness of its stops; used with play only."
+    )
+    piston_mass_kg: Positive = Field(
+        40.0, validate_default=True, description="Piston and rod; used with play only."
+    )
+    transducer_gain_error: Share = Field(
+        0.0, description="Gain error of the transducer that closes the stroke loop."
+    )
+    transducer_lag_ms: NonNegative = Field(
+        0.0, description="Delay of its filter, of two equal first-order stages."
+    )
+    attached_mass_kg: NonNegative = Field(
+        0.0, description="Mass attached to the frame, m_a: a floor or a wall that moves with it."
+    )
+    attached_frequency_hz: Positive = Field(
+        30.0, validate_default=True, description="Its frequency on a fixed frame."
+    )
+    attached_damping: NonNegative = Field(0.05, description="Its damping ratio on a fixed frame.")
+
+    @field_validator("static_friction_n")
+    @classmethod
+    def _check_static_friction(cls, static_n: float, info: ValidationInfo) -> float:
+        if static_n < info.data.get("friction_n", 0.0):
+            raise InputError("static_friction_n is below friction_n", allowed="at least friction_n")
+        return static_n
+
+    @field_validator("transducer_lag_ms")
+    @classmethod
+    def _check_lag(cls, lag_ms: float) -> float:
+        if 0.0 < lag_ms < MIN_TRANSDUCER_LAG_MS:
+            raise InputError(
+                "transducer_lag_ms is too short for the integrator",
+                allowed=f"0, or at least {MIN_TRANSDUCER_LAG_MS:g}",
+            )
+        return lag_ms
+
+    @field_validator("piston_mass_kg")
+    @classmethod
+    def _check_stops(cls, piston_kg: float, info: ValidationInfo) -> float:
+        stiffness_n_m = info.data.get("coupling_stiffness_n_m", 0.0)
+        stop_hz = math.sqrt(stiffness_n_m / piston_kg) / math.tau
+        if info.data.get("coupling_play_mm", 0.0) > 0.0 and stop_hz > MAX_FREQUENCY_HZ:
+            raise InputError(
+                f"the piston between its stops, at {stop_hz:.4g} Hz, is too fast to integrate",
+                allowed=f"at most {MAX_FREQUENCY_HZ:g} Hz",
+                remedy="lower coupling_stiffness_n_m or raise piston_mass_kg",
+            )
+        return piston_kg
+
+    @field_validator("attached_frequency_hz")
+    @classmethod
+    def _check_attached(cls, frequency_hz: float, info: ValidationInfo) -> float:
+        attached_kg = info.data.get("attached_mass_kg", 0.0)
+        # Of mass and frame against each other; on a fixed frame it is lower.
+        frame_kg = info.data.get("frame_mass_kg", math.inf)
+        free_hz = frequency_hz * math.sqrt(1.0 + attached_kg / frame_kg)
+        if attached_kg > 0.0 and free_hz > MAX_FREQUENCY_HZ:
+            raise InputError(
+                f"the attached mass against the frame, at {free_hz:.4g} Hz, is too fast to "
+                "integrate",
+                allowed=f"at most {MAX_FREQUENCY_HZ:g} Hz",
+                remedy="lower attached_frequency_hz or attached_mass_kg",
+            )
+        return frequency_hz
+
+    def oil_column_hz(self, mass_kg: float) -> float:
+        """Return the natural frequency of a moving mass in kg on the oil column, Hz."""
+        area_m2, volume_m3 = self.piston_area_cm2 * 1e-4, self.oil_volume_cm3 * 1e-6
+        stiffness_n_m = 4.0 * self.bulk_modulus_mpa * 1e6 * area_m2**2 / volume_m3
+        return math.sqrt(stiffness_n_m / mass_kg) / math.tau
 
 
 class FaultKind(NamedTuple):

@@ -41,8 +41,7 @@ from table_io.config.base import (
     parse_toml,
 )
 from table_io.errors import InputError
-from table_io.sim.hidden_entry import HiddenEntry, HiddenParameter
-from table_io.sim.imperfections import Imperfection
+from table_io.sim.imperfections import HiddenEntry, HiddenParameter, Imperfection
 
 
 class EffectDefinition(NamedTuple):

@@ -36,7 +36,7 @@ import math
 from typing import NamedTuple
 
 from table_io.compilation import inline_jit
-from table_io.sim.hydraulic_config import HydraulicTableConfig
+from table_io.sim.config import HydraulicTableConfig
 
 # Continues the state of `plant.py`: load pressure in Pa and its slow part, spool and its
 # rate in 1/s, bristles in m, frame in m and m/s.

@@ -16,10 +16,10 @@ from nidaqmx.errors import DaqNotFoundError
 from nidaqmx.system import System
 from typer.testing import CliRunner
 
-from table_io.backends.discovery import ChannelGroup, DiscoveredDevice
-from table_io.backends.ni import discovery as ni_found
-from table_io.backends.opendaq import discovery as daq_found
-from table_io.backends.opendaq.discovery import discover_devices as discover_opendaq_devices
+from table_io.backends import ChannelGroup, DiscoveredDevice
+from table_io.backends.ni import driver as ni_found
+from table_io.backends.opendaq import source as daq_found
+from table_io.backends.opendaq.source import discover_devices as discover_opendaq_devices
 from table_io.config import folders
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError

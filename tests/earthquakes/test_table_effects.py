@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
-from table_io.sim.hydraulic_config import HydraulicTableConfig
+from table_io.sim.config import HydraulicTableConfig
 from table_io.sim.hydraulic_table import make_coefficients
 from tests.earthquakes.hydraulic_rig import (
     RATE_HZ,

@@ -16,9 +16,8 @@ from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.ground_truth import GroundTruth, HiddenEffect
-from table_io.sim.ground_truth_applied import hide_laws
 from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection
-from table_io.sim.simulated_table import build_plant
+from table_io.sim.simulated_table import build_plant, hide_laws
 from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
 from twin.recording.reader import read_recording
 from twin.setup.run_config import from_texts

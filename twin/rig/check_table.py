@@ -17,12 +17,12 @@ import numpy as np
 from table_io.backends import (
     AcquisitionSource,
     Backend,
+    DigitalInputs,
     MachineLost,
     find_descriptor,
     open_backend,
     open_source,
 )
-from table_io.backends.digital_inputs import DigitalInputs
 from table_io.block import Float2D
 from table_io.clock import Clock, ManualClock, RealClock, local_datetime
 from table_io.config.base import PROFILES_DIR, load_config

@@ -14,8 +14,7 @@ from typing import Any, NoReturn
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from table_io.backends import check_reachable, get_descriptor
-from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
+from table_io.backends import DeviceSearch, DiscoveredDevice, check_reachable, get_descriptor
 from table_io.clock import RealClock
 from table_io.config.backend import BACKEND_GROUP
 from table_io.config.folders import list_configs

@@ -16,7 +16,7 @@ from table_io.config.profile import load_profile
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.server import serve_machine_table
-from table_io.sim.table_service import PlaybackPlan, TableService, find_simulator
+from table_io.sim.machine.table import PlaybackPlan, TableService, find_simulator
 from twin.live.process_config import request_realtime
 
 TABLE_PRIORITY = 60  # above the rig: a real machine does not depend on its load

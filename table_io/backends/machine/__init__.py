@@ -1,7 +1,7 @@
 """Backend for a simulated machine in a separate process (`shaketwin table`)."""
 
 from table_io.backends import Backend, BackendDescriptor
-from table_io.backends.machine.config import MachineConfig
+from table_io.backends.machine.protocol import MachineConfig
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig

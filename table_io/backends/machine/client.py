@@ -13,16 +13,17 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
-from table_io.backends.machine.config import MachineConfig
-from table_io.backends.machine.endpoint import connect, parse_endpoint
 from table_io.backends.machine.protocol import (
     REPLACE_AFTER_S,
+    MachineConfig,
     MachineMessage,
     MessageKind,
     MessageParser,
     ProtocolError,
     Refusal,
+    connect,
     encode_message,
+    parse_endpoint,
     text_message,
     values_message,
 )

@@ -3,9 +3,13 @@
 from collections.abc import Collection
 from functools import partial
 
-from table_io.backends import Backend, BackendDescriptor
-from table_io.backends.digital_inputs import DigitalInputs
-from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
+from table_io.backends import (
+    Backend,
+    BackendDescriptor,
+    DeviceSearch,
+    DigitalInputs,
+    DiscoveredDevice,
+)
 from table_io.backends.ni.config import NiWiring
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
@@ -16,10 +20,11 @@ from table_io.errors import InputError, format_pip_line
 def _require_library() -> None:
     """Raise InputError if NI's client library is not installed."""
     try:
+        import grpc  # noqa: F401
         import nidaqmx  # noqa: F401
-    except ImportError:
+    except ImportError as error:
         raise InputError(
-            "NI's client library is not installed",
+            f"NI's client library is not installed ({error})",
             key="backend",
             value="ni",
             remedy=format_pip_line("ni"),
@@ -35,7 +40,7 @@ def _open(rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> B
 
 def _check_reachable(rig: RigConfig) -> None:
     _require_library()
-    from table_io.backends.ni.probe import check_reachable
+    from table_io.backends.ni.driver import check_reachable
 
     check_reachable(rig)
 
@@ -46,13 +51,14 @@ def _open_digital_inputs(rig: RigConfig) -> DigitalInputs | None:
     if wiring is None or not wiring.digital_inputs:
         return None
     _require_library()
-    from table_io.backends.ni.digital_lines import NiDigitalInputs
+    from table_io.backends.ni.driver import NiDigitalInputs
 
     return NiDigitalInputs(wiring)
 
 
 def _discover(server: str | None) -> tuple[DiscoveredDevice, ...]:
-    from table_io.backends.ni.discovery import discover_devices
+    _require_library()
+    from table_io.backends.ni.driver import discover_devices
 
     return discover_devices(server)
 

@@ -1,13 +1,19 @@
 """Backend for a DAQmx device, whose output buffer holds the queued command.
 
-A separate thread reads the inputs (`reader.py`). Output and heartbeat are written by the caller's
-thread in every call and every wait, so the heartbeat of a rig that hangs stops. `errors.py` states
-the consequence of each driver error, `startup.py` has the checks before anything moves.
+A separate thread reads the inputs (`InputReader`). Output and heartbeat are written by the caller's
+thread in every call and every wait, so the heartbeat of a rig that hangs stops. `driver.py` states
+the consequence of each driver error, `tasks.py` has the checks before anything moves.
+
+The device's clock differs from the computer's by 10 to 50 ppm, 36 to 180 ms in an hour. The time of
+sample 0 therefore follows two rules: no sample arrives before it is taken, and the smallest delay
+in each window of samples equals the smallest delay in the first window.
 """
 
 import contextlib
 import math
+import threading
 from collections.abc import Callable
+from queue import Empty, Queue
 from typing import Any, NoReturn, TypeVar
 
 import numpy as np
@@ -15,18 +21,103 @@ from nidaqmx.errors import DaqError, Error
 
 from table_io.backends import HEARTBEAT_TIMEOUT_S, SAMPLE_TIMEOUT_S, MachineLost
 from table_io.backends.command_buffer import CommandBuffer
-from table_io.backends.ni import startup
-from table_io.backends.ni.channel import connect_server
-from table_io.backends.ni.clock_sync import ClockSync
-from table_io.backends.ni.errors import REMEDIES, ErrorSource, describe_error, describe_loss
-from table_io.backends.ni.probe import describe_interlock_fault, require_ni_wiring
-from table_io.backends.ni.reader import InputReader
-from table_io.backends.ni.tasks import BUFFER_S, HEARTBEAT_PERIOD_S, RigTasks
+from table_io.backends.ni.driver import (
+    REMEDIES,
+    ErrorSource,
+    connect_server,
+    describe_error,
+    describe_interlock_fault,
+    describe_loss,
+    require_ni_wiring,
+)
+from table_io.backends.ni.tasks import (
+    BUFFER_S,
+    HEARTBEAT_PERIOD_S,
+    SETTLE_S,
+    RigTasks,
+    clear_leftover_tasks,
+    read_at_rest,
+    replace_after_samples,
+    require_rest,
+    verify_output_replacement,
+    verify_sample_rate,
+)
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+
+WINDOW_S = 5.0
+MAX_SHIFT_S = 1e-3  # correction per window, at most: 200 ppm
+
+
+class ClockSync:
+    """Estimate of `epoch_s`, the time of sample 0 in s, from the arrival times of samples."""
+
+    def __init__(self, rate_hz: float, epoch_s: float) -> None:
+        self.epoch_s = epoch_s
+        self._rate_hz = rate_hz
+        self._reference_delay_s: float | None = None
+        self._min_delay_s = math.inf
+        self._window_start = 0
+
+    def update(self, last: int, now_s: float) -> None:
+        """Update the estimate: sample `last` had arrived at `now_s`, in s."""
+        delay_s = now_s - last / self._rate_hz - self.epoch_s
+        if delay_s < 0:
+            self.epoch_s += delay_s
+            delay_s = 0.0
+        self._min_delay_s = min(self._min_delay_s, delay_s)
+        if last < self._window_start + WINDOW_S * self._rate_hz:
+            return
+        if self._reference_delay_s is None:
+            self._reference_delay_s = self._min_delay_s
+        shift_s = self._min_delay_s - self._reference_delay_s
+        self.epoch_s += max(-MAX_SHIFT_S, min(shift_s, MAX_SHIFT_S))
+        self._window_start, self._min_delay_s = last, math.inf
+
+
+ReadInputs = Callable[[int], Float2D]
+
+
+class InputReader:
+    """Reader thread for one request at a time: a driver that hangs does not block the caller."""
+
+    def __init__(self, read_inputs: ReadInputs) -> None:
+        self._read_inputs = read_inputs
+        self._requests: Queue[int] = Queue(1)
+        self._results: Queue[Float2D | Exception] = Queue(1)
+        self._thread = threading.Thread(target=self._run, name="input", daemon=True)
+        self._thread.start()
+
+    def request(self, samples: int) -> None:
+        """Request the next `samples` samples, 1 or more."""
+        self._requests.put_nowait(samples)
+
+    def poll(self, timeout_s: float) -> Float2D | None:
+        """Return the requested volts, (channel, sample), or None; raise the error of the read."""
+        try:
+            result = self._results.get(timeout=timeout_s)
+        except Empty:
+            return None
+        if isinstance(result, Exception):
+            raise result
+        return result
+
+    def close(self, timeout_s: float) -> None:
+        """End the thread; abandon it if the driver blocks it longer than the timeout."""
+        if self._requests.empty():
+            self._requests.put_nowait(0)
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        while samples := self._requests.get():
+            try:
+                self._results.put(self._read_inputs(samples))
+            except Exception as error:
+                self._results.put(error)
+
 
 HOLD_S = 2.0  # of the last value after the queued command, against an output underrun
 POLL_S = 0.002  # of real time, between checks whether a heartbeat is due
@@ -46,7 +137,7 @@ class NiBackend:
         self._wiring = require_ni_wiring(rig)
         self.channels = rig.channels
         self.rate_hz = rate_hz
-        self.replace_after = startup.replace_after_samples(rig, rate_hz)
+        self.replace_after = replace_after_samples(rig, rate_hz)
         self._rig, self._clock, self._channel = rig, clock, channel
         self._tasks: RigTasks | None = None
         self._reader: InputReader | None = None
@@ -67,15 +158,15 @@ class NiBackend:
             self._channel = connect_server(rig, self._wiring.endpoint)
         try:
             if self._channel is not None:
-                startup.clear_leftover_tasks(rig, self._channel, clock)
+                clear_leftover_tasks(rig, self._channel, clock)
             tasks = RigTasks(rig, rate, self._channel)
             try:
-                startup.verify_sample_rate(tasks, rate)
-                startup.require_rest(rig, tasks, rate, clock)
-                startup.verify_output_replacement(rig, tasks, rate)
+                verify_sample_rate(tasks, rate)
+                require_rest(rig, tasks, rate, clock)
+                verify_output_replacement(rig, tasks, rate)
             finally:
                 tasks.clear()  # tasks that have played cannot be started again at sample 0
-            clock.wait_until(clock.now() + startup.SETTLE_S)
+            clock.wait_until(clock.now() + SETTLE_S)
             tasks = RigTasks(rig, rate, self._channel)
         except Error as error:
             code = error.error_code if isinstance(error, DaqError) else 0
@@ -95,10 +186,10 @@ class NiBackend:
         """Return volts at rest, before precompression, (channel, sample)."""
         tasks = self._require_tasks()
 
-        def read_at_rest() -> Float2D:
-            return startup.read_at_rest(tasks, samples, self.rate_hz, self._send_heartbeat)
+        def read_volts() -> Float2D:
+            return read_at_rest(tasks, samples, self.rate_hz, self._send_heartbeat)
 
-        return self._call_driver("input", read_at_rest)
+        return self._call_driver("input", read_volts)
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, volts (sample,); the last value is held."""

@@ -2,8 +2,7 @@
 
 from collections.abc import Collection
 
-from table_io.backends import AcquisitionSource, BackendDescriptor
-from table_io.backends.discovery import DeviceSearch, DiscoveredDevice
+from table_io.backends import AcquisitionSource, BackendDescriptor, DeviceSearch, DiscoveredDevice
 from table_io.backends.opendaq.config import OpenDaqWiring
 from table_io.clock import Clock
 from table_io.config.rig import RigConfig
@@ -23,7 +22,7 @@ def _check_reachable(rig: RigConfig) -> None:
 
 def _list_searches(addresses: Collection[str]) -> dict[str, DeviceSearch]:
     def search() -> tuple[DiscoveredDevice, ...]:
-        from table_io.backends.opendaq.discovery import discover_devices
+        from table_io.backends.opendaq.source import discover_devices
 
         return discover_devices(tuple(addresses))
 

@@ -1,11 +1,11 @@
 """Backend for a real-time target over UDP: dSPACE, Speedgoat, LabVIEW-RT, a PLC. See PACKETS.md.
 
-Rig side: backend.py, link.py, transfer.py. Packets: packets.py. Target side: target.c, and the
+Rig side: backend.py, link.py. Packets: packets.py. Target side: target.c, and the
 simulated target in table_io/sim/udp.
 """
 
 from table_io.backends import Backend, BackendDescriptor
-from table_io.backends.udp.config import UdpWiring
+from table_io.backends.udp.link import UdpWiring, check_reachable
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
@@ -17,10 +17,4 @@ def _open(rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> B
     return UdpBackend(rig, specimen, rate_hz, clock)
 
 
-def _check_reachable(rig: RigConfig) -> None:
-    from table_io.backends.udp.link import check_reachable
-
-    check_reachable(rig)
-
-
-BACKEND = BackendDescriptor(config=UdpWiring, open=_open, check_reachable=_check_reachable)
+BACKEND = BackendDescriptor(config=UdpWiring, open=_open, check_reachable=check_reachable)

@@ -6,19 +6,19 @@ import socket
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from table_io.backends.machine.config import MachineConfig
-from table_io.backends.machine.endpoint import open_listener, parse_endpoint
 from table_io.backends.machine.protocol import (
+    MachineConfig,
     MachineMessage,
     MessageKind,
     MessageParser,
     Refusal,
     encode_message,
+    open_listener,
+    parse_endpoint,
     text_message,
 )
 from table_io.clock import Clock
-from table_io.sim.machine.table import SimulatedMachine
-from table_io.sim.table_service import TableService
+from table_io.sim.machine.table import SimulatedMachine, TableService
 
 TICK_S = 0.005  # of real time, between two updates of the plant
 IDLE_TICK_S = 0.1  # the same while nothing moves

@@ -6,7 +6,7 @@ from table_io.block import Float1D
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from table_io.sim.controller import DrivePlayback
+from table_io.sim.opendaq import DrivePlayback
 from table_io.sim.simulated_table import SimulatedBackend
 
 

@@ -16,7 +16,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.ni.device import SimulatedDaqDevice
-from table_io.sim.ni.interlock import InterlockedTable
+from table_io.sim.ni.server import InterlockedTable
 from table_io.sim.ni.service import NiDeviceService
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})

@@ -18,7 +18,7 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.sim.config import SimulatedTableConfig
-from table_io.sim.machine.connection import MachineSession
+from table_io.sim.machine.table import MachineSession
 from table_io.sim.opendaq import NS_PER_S, TICK_S, OpenDaqServer
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})

@@ -21,7 +21,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
-from table_io.sim.table_service import SIMULATOR_GROUP, find_simulator
+from table_io.sim.machine.table import SIMULATOR_GROUP, find_simulator
 from tests.command_line import call_main
 
 ROOT = Path(__file__).resolve().parents[3]

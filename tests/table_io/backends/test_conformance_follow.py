@@ -7,7 +7,7 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.clock import Clock, ManualClock, RealClock
-from table_io.sim.controller import DrivePlayback
+from table_io.sim.opendaq import DrivePlayback
 from tests.table_io.acquisition.external_controller import Bystander
 from tests.table_io.backends.conformance import ACQUIRING, CLAUSES, RATE_HZ, Bench
 from tests.table_io.backends.test_conformance import BROKEN, SPECIMEN, card

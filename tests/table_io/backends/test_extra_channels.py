@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from table_io.backends import AcquisitionSource, Backend
-from table_io.backends.ni.probe import require_ni_wiring
+from table_io.backends.ni.driver import require_ni_wiring
 from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml

@@ -12,13 +12,15 @@ import pytest
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost, check_reachable
 from table_io.backends.machine.client import MachineBackend
-from table_io.backends.machine.config import MachineConfig
-from table_io.backends.machine.endpoint import Endpoint, open_listener, parse_endpoint
 from table_io.backends.machine.protocol import (
+    Endpoint,
+    MachineConfig,
     MachineMessage,
     MessageKind,
     MessageParser,
     encode_message,
+    open_listener,
+    parse_endpoint,
     values_message,
 )
 from table_io.clock import Clock, RealClock

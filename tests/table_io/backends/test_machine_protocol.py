@@ -6,7 +6,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from table_io.backends.command_buffer import CommandBuffer, can_hold, plan_stop
-from table_io.backends.machine.endpoint import parse_endpoint
 from table_io.backends.machine.protocol import (
     HEADER,
     MAX_PAYLOAD_BYTES,
@@ -15,6 +14,7 @@ from table_io.backends.machine.protocol import (
     MessageParser,
     ProtocolError,
     encode_message,
+    parse_endpoint,
 )
 from table_io.errors import InputError
 

@@ -12,8 +12,7 @@ import pytest
 
 from table_io.acquisition.session import SessionSetup, run_session
 from table_io.backends import MachineLost, check_reachable
-from table_io.backends.ni.backend import NiBackend
-from table_io.backends.ni.clock_sync import ClockSync
+from table_io.backends.ni.backend import ClockSync, NiBackend
 from table_io.backends.ni.config import NiFault
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock, RealClock
@@ -23,9 +22,8 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop, SampleGap, Trip
 from table_io.sim.machine.flight_recorder import read_flight_record
-from table_io.sim.ni.device import SimulatedDaqDevice
+from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
-from table_io.sim.ni.task import DriverError, ErrorCode, Task
 from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
 

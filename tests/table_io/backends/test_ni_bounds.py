@@ -12,19 +12,17 @@ import pytest
 from nidaqmx._stubs import nidaqmx_pb2 as pb
 
 from table_io.backends import MachineLost
-from table_io.backends.ni import channel
+from table_io.backends.ni import driver
 from table_io.backends.ni.backend import NiBackend
-from table_io.backends.ni.errors import REMEDIES
-from table_io.backends.ni.probe import check_reachable
+from table_io.backends.ni.driver import REMEDIES, check_reachable
 from table_io.block import Float1D
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import read_flight_record
-from table_io.sim.ni.device import SimulatedDaqDevice
+from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
-from table_io.sim.ni.task import DriverError, ErrorCode, Task
 from tests.studies.ni import serve_table
 from tests.studies.ni_error_codes import RATE_HZ, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
@@ -49,7 +47,7 @@ def test_a_server_that_stands_still_in_motion_holds_neither_read_nor_close(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A dozen calls meet their deadline here, one after another.
-    monkeypatch.setattr(channel, "CALL_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(driver, "CALL_TIMEOUT_S", 1.0)
     with serve_table(tmp_path) as (_, rig, process):
         backend = NiBackend(rig, SPECIMEN, RATE_HZ, RealClock())
         backend.open()

@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from table_io.backends.opendaq.assembly import (
+from table_io.backends.opendaq.timestamps import (
     GROWTH_SAMPLES,
     Assembly,
     ClockJumpError,
     UnevenClockError,
+    require_simultaneous,
     sample_indices,
 )
-from table_io.backends.opendaq.timestamps import require_simultaneous
 from table_io.errors import InputError
 
 

@@ -19,8 +19,7 @@ from table_io.backends import (
     open_backend,
 )
 from table_io.backends.udp.backend import UdpBackend
-from table_io.backends.udp.config import UdpWiring
-from table_io.backends.udp.link import REASON_TEXTS, query_target
+from table_io.backends.udp.link import REASON_TEXTS, UdpWiring, query_target
 from table_io.backends.udp.packets import (
     PacketKind,
     Phase,
@@ -38,8 +37,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SimulatedMachine
-from table_io.sim.udp.server import bind_socket, serve_udp_target
-from table_io.sim.udp.target import UdpTarget
+from table_io.sim.udp.server import UdpTarget, bind_socket, serve_udp_target
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     TEXT,

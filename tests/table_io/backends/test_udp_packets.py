@@ -13,6 +13,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from table_io.backends import udp
+from table_io.backends.udp.backend import (
+    CLOCK_WINDOW_S,
+    RESEND_S,
+    WINDOW_PIECES,
+    ClockOffset,
+    CommandTransfer,
+    ReceiveBuffer,
+)
 from table_io.backends.udp.packets import (
     MAX_PIECES,
     RIG_HEADER,
@@ -31,14 +39,6 @@ from table_io.backends.udp.packets import (
     decode_target_state,
     encode_rig_packet,
     encode_target_state,
-)
-from table_io.backends.udp.transfer import (
-    CLOCK_WINDOW_S,
-    RESEND_S,
-    WINDOW_PIECES,
-    ClockOffset,
-    CommandTransfer,
-    ReceiveBuffer,
 )
 
 RATE_HZ = 2000.0

@@ -10,7 +10,7 @@ from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 
 from table_io.backends import MachineLost, find_descriptor
 from table_io.backends.ni.config import NiWiring
-from table_io.backends.ni.digital_lines import NiDigitalInputs
+from table_io.backends.ni.driver import NiDigitalInputs
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.rig import RigConfig

@@ -7,7 +7,7 @@ import pytest
 from scipy import signal
 
 from table_io.block import Float2D
-from table_io.sim.filters import AnalogFilter, FractionalDelay
+from table_io.sim.laboratory import AnalogFilter, FractionalDelay
 
 RATE_HZ = 1000.0
 TURN = 2 * np.pi

@@ -22,8 +22,7 @@ from table_io.sim.ground_truth import (
     GroundTruth,
     parse_ground_truth,
 )
-from table_io.sim.ground_truth_applied import SensorDistortion
-from table_io.sim.simulated_table import SimulatedBackend
+from table_io.sim.simulated_table import SensorDistortion, SimulatedBackend
 from tests.builders.truths import seal_truth
 from twin.model.effects import EFFECTS
 from twin.recording.reader import read_recording

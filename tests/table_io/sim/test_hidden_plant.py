@@ -10,8 +10,8 @@ from scipy.linalg import expm
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition, GroundTruth
-from table_io.sim.ground_truth_applied import hide_laws
 from table_io.sim.plant import SIGNALS, HiddenCoefficients, Plant
+from table_io.sim.simulated_table import hide_laws
 from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
 from tests.table_io.sim.hidden_reference import CJ, KJ, MT, C, G, H, K, M, Reference

@@ -16,7 +16,6 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.ground_truth import GroundTruth
-from table_io.sim.ground_truth_applied import hide_laws
 from table_io.sim.imperfections import (
     IMPERFECTION_DEFINITIONS,
     IMPERFECTION_IDS,
@@ -26,7 +25,7 @@ from table_io.sim.imperfections import (
 )
 from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import Plant
-from table_io.sim.simulated_table import Digitizer, SimulatedBackend
+from table_io.sim.simulated_table import Digitizer, SimulatedBackend, hide_laws
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 CHANNELS = RIG.channels

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Float2D
-from table_io.sim.ni.device import SimulatedDaqDevice
-from table_io.sim.ni.task import (
+from table_io.sim.ni.device import (
     FIRST_SAMPLE,
     WHEN_EMPTY,
     WHEN_NOT_FULL,
     DriverError,
     ErrorCode,
+    SimulatedDaqDevice,
     Task,
 )
 

@@ -38,7 +38,7 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
 from table_io.sim.machine.table import SimulatedMachine
-from table_io.sim.udp.target import UdpTarget
+from table_io.sim.udp.server import UdpTarget
 from tests.table_io.backends.udp_bench import FLAGS, SOURCES, TEXT
 
 RATE_HZ = 2000.0

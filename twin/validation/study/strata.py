@@ -18,8 +18,12 @@ import numpy as np
 
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, EffectDefinition
-from table_io.sim.hidden_entry import HiddenParameter
-from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection, draw_laboratory
+from table_io.sim.imperfections import (
+    IMPERFECTION_IDS,
+    HiddenParameter,
+    Imperfection,
+    draw_laboratory,
+)
 
 NUMBERS_PER_CELL = 1000  # case numbers reserved per cell
 RESIDUAL_SIZES = (1.5, 3.0, 10.0)  # residual of the base model over the noise floor
