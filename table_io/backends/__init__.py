@@ -61,9 +61,8 @@ from typing import Literal, Protocol
 
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
-from table_io.config.backend import BackendConfig, require_backend
 from table_io.config.profile import Profile, Specimen
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig, require_backend
 from table_io.errors import InputError
 
 

@@ -9,10 +9,9 @@ from pydantic import Field
 
 from table_io.backends import AcquisitionSource, BackendDescriptor, get_descriptor
 from table_io.clock import Clock
-from table_io.config.backend import BACKEND_GROUP, BackendConfig, load_backend
 from table_io.config.base import Number
 from table_io.config.plugins import list_entry_points
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BACKEND_GROUP, BackendConfig, RigConfig, load_backend
 
 
 class FollowWiring(BackendConfig):

@@ -31,17 +31,12 @@ from table_io.config.base import (
     parse_toml,
     read_text,
 )
-from table_io.config.excitation import (  # those without a use here register their kind
+from table_io.config.excitation import (  # those without a use here register their kinds
     Excitation,
     ExcitationPlan,
     History,
-    backbone,  # noqa: F401
-    band_random,  # noqa: F401
-    chirp,  # noqa: F401
-    cyclic,  # noqa: F401
-    half_sine,  # noqa: F401
     record,  # noqa: F401
-    sine_pulse,  # noqa: F401
+    synthetic,  # noqa: F401
 )
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep

@@ -1,10 +1,14 @@
 """Rig file: limits, command output, sensors and wiring of a shaking table.
 
 Keys carry their unit in the name (`span_mm`, `lead_s`); properties return SI.
+
+A backend registers under its name in the entry-point group `shaketwin.backends`. Its module is
+imported when a rig file names it, not before.
 """
 
 from collections.abc import Mapping
-from typing import Any, Self, TypeVar
+from functools import cache
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from pydantic import (
     ConfigDict,
@@ -18,13 +22,96 @@ from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import InitErrorDetails
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
-from table_io.config.backend import BACKEND_GROUP, BackendConfig, load_backend
-from table_io.config.base import ConfigModel, NonNegative, Number, Positive, list_duplicates
-from table_io.config.calibration_record import CalibrationRecord
+from table_io.config.base import (
+    ConfigModel,
+    NonNegative,
+    Number,
+    Positive,
+    list_duplicates,
+)
 from table_io.config.channel import ChannelConfig
-from table_io.config.plugins import list_entry_points
-from table_io.config.sensor import SensorConfig, check_sensor_unit
+from table_io.config.plugins import list_entry_points, load_entry_point
+from table_io.config.sensor import (
+    CalibrationRecord,
+    SensorConfig,
+    check_sensor_unit,
+)
 from table_io.errors import InputError, suggest
+
+BACKEND_GROUP = "shaketwin.backends"
+REINSTALL = "install shaketwin again (pip install -e . in a source tree)"
+
+
+class BackendConfig(ConfigModel):
+    """Base class of the section `[name]` in which a rig file configures the backend `name`."""
+
+    def list_faults(self, rig: "RigConfig") -> list[str]:
+        """List contradictions between this section and the rest of the rig file."""
+        return []
+
+    def find_address(self, rig: "RigConfig") -> str:
+        """Return the address of the machine as written in the rig file; "" if it has none."""
+        return ""
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings of the pre-flight check about allowed but less safe settings."""
+        return []
+
+    @property
+    def max_start_wait_s(self) -> float:
+        """Longest recorded wait for the table to be started, in s."""
+        return 0.0
+
+
+@runtime_checkable
+class InstalledBackend(Protocol):
+    """What a rig file needs of `table_io.backends.BackendDescriptor`."""
+
+    @property
+    def config(self) -> type[BackendConfig]: ...
+    @property
+    def drives(self) -> bool: ...
+    @property
+    def any_speed(self) -> bool: ...
+    @property
+    def is_simulated(self) -> bool: ...
+    @property
+    def external_control(self) -> bool: ...
+
+
+@cache
+def load_backend(name: str) -> InstalledBackend | None:
+    """Import the backend `name`, None if it is not installed; InputError if it is unusable."""
+    backend = load_entry_point(BACKEND_GROUP, name)
+    if backend is not None and not isinstance(backend, InstalledBackend):
+        raise InputError(
+            f"is a {type(backend).__name__}",
+            where=BACKEND_GROUP,
+            key=name,
+            allowed="a BackendDescriptor",
+            remedy="fix or remove the package",
+        )
+    return backend
+
+
+def require_backend(name: str, where: object, key: str = "backend") -> InstalledBackend:
+    """Return the backend `name`; InputError if it is not installed."""
+    backend = load_backend(name)
+    if backend is None:
+        names = ", ".join(list_entry_points(BACKEND_GROUP))
+        raise InputError(
+            "no installed package provides this backend",
+            where=where,
+            key=key,
+            value=name,
+            allowed=names or "none is installed",
+            remedy="correct the name, or install the package that provides it"
+            if names
+            else REINSTALL,
+        )
+    return backend
+
 
 SectionT = TypeVar("SectionT", bound=BackendConfig)
 

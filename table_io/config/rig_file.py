@@ -3,14 +3,13 @@
 from datetime import UTC, datetime
 from pathlib import Path
 
-from table_io.config.backend import require_backend
 from table_io.config.base import load_config, parse_toml
-from table_io.config.calibration_record import (
+from table_io.config.rig import RigConfig, require_backend
+from table_io.config.sensor import (
     CalibrationFile,
     CalibrationRecord,
     format_calibration_toml,
 )
-from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 
 

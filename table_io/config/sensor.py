@@ -1,16 +1,35 @@
-"""Sensor config: scaling to volts, instrument data and calibration dates.
+"""Sensor config: scaling to volts, instrument data, calibration dates and calibration records.
 
-Dates are ISO (2026-03-01). Dates never stop a test; `calibration_due.py` reports overdue ones.
+Dates are ISO (2026-03-01). Dates never stop a test; `calibration.py` reports overdue ones.
+
+`shaketwin calibrate` writes each record to a new file `<date>-<time>-<channel>.toml` in the folder
+RIG.calibrations/ next to the rig file RIG.toml. It is TOML with one `[[calibrations]]` table, which
+also fits at the end of a rig file. When the rig file is read for a run (`load_rig`), the newest
+record of each channel is appended to its text, and so enters every recording.
+
+    channel, unit, serial      of the sensor, as in the rig file
+    at, by, method             ISO 8601 time; operator; "points" or "shunt"
+    applied                    in `unit`, applied values, one second each
+    applied_sd                 in `unit`, standard uncertainty of the applied values; 0: not stated
+    volts, volts_sd            mean at each applied value, and its standard error
+    volts_per_unit, .._sd      sensitivity and its standard uncertainty; the standard error of each
+                               point is at least one converter step / sqrt(12)
+    offset, offset_sd          in `unit`: volts = (value + offset) * volts_per_unit
+    linearity_percent          largest residual in per cent of the span; from three points on
+    card_volts_per_unit        sensitivity in the rig file at that time
+    departure_percent, .._sd   of the sensitivity from the rig file, in per cent and in its sd
+    tolerance_percent, passed  allowed departure, and whether it was met
 """
 
 import calendar
 import re
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.units import UNITS
 
@@ -156,3 +175,43 @@ class SensorConfig(ConfigModel):
         if self.due is not None or self.calibrated is None or self.interval_months is None:
             return self.due
         return _add_months(self.calibrated, self.interval_months)
+
+
+class CalibrationRecord(ConfigModel):
+    """Record of one calibration."""
+
+    channel: str = Field(description="Channel of the sensor.")
+    unit: str = Field(description="Unit of the applied values.")
+    serial: str = Field("", description="Serial number of the sensor.")
+    at: str = Field(description="Time of the calibration, ISO 8601.")
+    by: str = Field(description="Name of the operator.")
+    method: Literal["points", "shunt"] = Field(description="Applied values or a shunt.")
+    applied: tuple[Finite, ...] = Field(min_length=2, description="Applied values, in `unit`.")
+    applied_sd: NonNegative = Field(
+        0.0, description="Standard uncertainty of the applied values; 0: not stated."
+    )
+    volts: tuple[Finite, ...] = Field(description="Mean voltage at each applied value.")
+    volts_sd: tuple[NonNegative, ...] = Field(description="Standard error of each mean.")
+    volts_per_unit: Finite = Field(description="Sensitivity.")
+    volts_per_unit_sd: NonNegative = Field(description="Standard uncertainty of the sensitivity.")
+    offset: Finite = Field(description="In `unit`: volts = (value + offset) * volts_per_unit.")
+    offset_sd: NonNegative = Field(description="Standard uncertainty of the offset.")
+    linearity_percent: NonNegative | None = Field(
+        None, description="Largest residual over the span; from three points on."
+    )
+    card_volts_per_unit: Finite = Field(description="Sensitivity in the rig file at that time.")
+    departure_percent: Finite = Field(description="Departure of the sensitivity from the rig file.")
+    departure_sd: Finite | None = Field(None, description="The same in its standard uncertainty.")
+    tolerance_percent: Positive = Field(description="Allowed departure.")
+    passed: bool = Field(description="Whether the departure is allowed.")
+
+
+class CalibrationFile(ConfigModel):
+    """File with one or more calibration records."""
+
+    calibrations: tuple[CalibrationRecord, ...] = Field(min_length=1)
+
+
+def format_calibration_toml(record: CalibrationRecord) -> str:
+    """Serialize the record as TOML; numbers keep all digits."""
+    return format_toml({"calibrations": [record.model_dump(exclude_none=True)]}).lstrip("\n")

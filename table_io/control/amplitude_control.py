@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from table_io.config.profile import ControlConfig
-from table_io.control.frf import evaluate_transfer
-from table_io.control.order_tracking import HarmonicFit
+from table_io.control.order_tracking import HarmonicFit, evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import FrequencyResponse, Step
 

@@ -23,8 +23,7 @@ import numpy as np
 from table_io.block import Float1D, Int1D
 from table_io.config.excitation.orbit_plan import unpack_harmonics
 from table_io.config.excitation.waveform import smoothstep
-from table_io.excitation.correction import Correction
-from table_io.excitation.drive import MAX_BLEND_CURVATURE, Drive
+from table_io.excitation.drive import MAX_BLEND_CURVATURE, Correction, Drive
 
 WINDOW_S = 0.03  # of the fit: longer rejects more noise, shorter follows a faster growth
 BLEND_S = 0.02  # from the previous function to the next

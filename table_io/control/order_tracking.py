@@ -1,16 +1,23 @@
-"""Order tracking: least-squares fit of harmonics at the known phase of the drive.
+"""Order tracking: least-squares fit of harmonics at the phase of the drive, and the table's FRF.
 
 x(t) = offset + sum over k of Im(c_k exp(2 pi i k phase)), so a real c_1 is in phase with the
 acceleration sine of the drive. The phase is the closed form of the drive at each sample, so only
 amplitudes are estimated, and a cycle need not be a whole number of samples.
+
+The FRF is interpolated and extrapolated from the identified frequencies. Two quantities are nearly
+polynomials for any displacement servo: 1 / gain^2 in f^2 (exactly, of second degree, for a loop
+with two poles) and the phase, odd in f, linear where a delay dominates. Up to three terms of the
+first and two of the second are fitted, limited by the number of points.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D
+from table_io.records import FrequencyResponse
 
 HARMONIC_COUNT = 10
 Complex1D = npt.NDArray[np.complex128]
@@ -83,3 +90,55 @@ def _fit_harmonics(basis: Float1D, values: Float1D, harmonics: int) -> HarmonicF
     amplitudes[: columns // 2] = solution[1::2] + 1j * solution[2::2]
     rms = float(np.sqrt(np.mean((values - np.einsum("ij,j->i", basis, solution)) ** 2)))
     return HarmonicFit(float(solution[0]), amplitudes, rms)
+
+
+GAIN_TERMS, PHASE_TERMS = 3, 2
+MAX_GAIN_EXTRAPOLATION = 4.0  # a gain stays within this factor of the identified range
+LSTSQ_RCOND = 1e-3  # points closer together than this do not determine a slope
+
+
+def evaluate_transfer(response: FrequencyResponse, frequency_hz: float) -> complex:
+    """Evaluate the complex FRF, table acceleration over command, at a frequency in Hz."""
+    frequencies = np.array(response.frequencies_hz)
+    top = float(frequencies.max())
+    powers = 2 * np.arange(min(PHASE_TERMS, frequencies.size)) + 1
+    coefficients = _solve_least_squares(
+        (frequencies / top)[:, None] ** powers, np.array(response.phase_rad)
+    )
+    angle = float(coefficients @ (frequency_hz / top) ** powers)
+    return evaluate_gain(response, frequency_hz) * complex(math.cos(angle), math.sin(angle))
+
+
+def evaluate_gain(response: FrequencyResponse, frequency_hz: float) -> float:
+    """Evaluate the gain of the table, acceleration over command, at a frequency in Hz.
+
+    Below the identified band it is constant, because a servo is flat there. Above it 1 / gain^2
+    continues linearly in f^2, because the curvature from a few points is mostly noise.
+    """
+    frequencies = np.array(response.frequencies_hz)
+    inverse = np.array(response.gain) ** -2.0
+    low, top = float(frequencies.min()), float(frequencies.max())
+    z = (frequencies / top) ** 2
+    curve = _fit_polynomial(z, inverse, min(GAIN_TERMS, frequencies.size))
+    value = _evaluate_polynomial(curve, min(max(frequency_hz, low), top) / top)
+    if frequency_hz > top:
+        chord = _fit_polynomial(z, inverse, min(2, frequencies.size))
+        value += _evaluate_polynomial(chord, frequency_hz / top) - _evaluate_polynomial(chord, 1.0)
+    min_inverse, max_inverse = (
+        float(inverse.min()) / MAX_GAIN_EXTRAPOLATION**2,
+        float(inverse.max()) * MAX_GAIN_EXTRAPOLATION**2,
+    )
+    return float(min(max(value, min_inverse), max_inverse) ** -0.5)
+
+
+def _fit_polynomial(z: Float1D, values: Float1D, terms: int) -> Float1D:
+    """Fit a polynomial to values at z, (point,), by least squares; coefficients, (terms,)."""
+    return _solve_least_squares(z[:, None] ** np.arange(terms), values)
+
+
+def _evaluate_polynomial(coefficients: Float1D, ratio: float) -> float:
+    return float(coefficients @ ratio ** (2 * np.arange(coefficients.size)))
+
+
+def _solve_least_squares(basis: Float1D, values: Float1D) -> Float1D:
+    return np.asarray(np.linalg.lstsq(basis, values, rcond=LSTSQ_RCOND)[0], dtype=np.float64)

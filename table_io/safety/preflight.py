@@ -11,7 +11,7 @@ from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
-from table_io.control.frf import evaluate_gain
+from table_io.control.order_tracking import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, HistorySegment, Segment
 from table_io.records import FrequencyResponse, Step

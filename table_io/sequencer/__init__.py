@@ -17,7 +17,7 @@ ends at rest.
 import math
 from dataclasses import replace
 
-from table_io.adaptive import make_policy
+from table_io.adaptive.policy import make_policy
 from table_io.block import Block, Label
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.profile import Profile

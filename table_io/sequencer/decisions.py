@@ -5,8 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from table_io.adaptive import Decision, StepResult
-from table_io.adaptive.result import mean_swing
+from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Float1D, Label, join_blocks
 from table_io.channels import relative_displacement
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target

@@ -38,9 +38,8 @@ from table_io.config.excitation.continuation import (
     Continuation,
 )
 from table_io.config.excitation.orbit_plan import OrbitPlan, pack_harmonics, unpack_harmonics
-from table_io.control.frf import evaluate_transfer
 from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, advance_feedback
-from table_io.control.order_tracking import HarmonicFit, track_harmonics
+from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
 from table_io.excitation.trajectory import SineTarget, Trajectory
 from table_io.records import Event, FrequencyResponse, OrbitPoint
 from table_io.sequencer.releases import (

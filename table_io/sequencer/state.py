@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass, field
 
-from table_io.adaptive import Policy, StepResult
 from table_io.adaptive.continuation import MeasuredOrbit, OrbitTarget
+from table_io.adaptive.policy import Policy
+from table_io.adaptive.result import StepResult
 from table_io.block import Block, Float1D
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig

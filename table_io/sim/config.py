@@ -8,9 +8,8 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError, suggest
 from table_io.sim.ground_truth import GroundTruth
 

@@ -14,11 +14,11 @@ from table_io.backends import MachineLost
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock, ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.calibration_fit import MeanVoltage, mean_voltage
-from table_io.config.calibration_record import CalibrationRecord
+from table_io.config.calibration import MeanVoltage, mean_voltage
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
+from table_io.config.sensor import CalibrationRecord
 from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.input_errors import raises_input_error

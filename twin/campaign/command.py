@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from table_io.clock import local_datetime
-from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.errors import InputError
 from twin.campaign.config import list_campaign_warnings, read_plan
 from twin.campaign.merge import read_summary

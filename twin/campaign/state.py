@@ -12,7 +12,7 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from table_io.adaptive import make_policy
+from table_io.adaptive.policy import make_policy
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import ConfigModel
 from table_io.config.profile import Profile, ResumeConfig, SetUpConfirmation

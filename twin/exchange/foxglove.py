@@ -15,8 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from table_io.block import Int1D
-from table_io.messages import format_record
-from table_io.records import Event, NormalizedResponse, PrcPoint, Record
+from table_io.records import Event, NormalizedResponse, PrcPoint, Record, format_record
 from twin.recording.mcap_log import open_foreign_log
 from twin.recording.tabular import (
     DIRECTION_SIGNS,

@@ -11,14 +11,13 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from table_io.channels import CHANNELS
-from table_io.config.backend import BACKEND_GROUP, load_backend
 from table_io.config.base import PROFILES_DIR, ConfigModel
 from table_io.config.excitation import Excitation
 from table_io.config.folders import list_configs
 from table_io.config.key_reference import KeyDescription, TableDescription, describe_tables
 from table_io.config.plugins import list_entry_points
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BACKEND_GROUP, RigConfig, load_backend
 from table_io.errors import InputError, suggest
 from twin.cli.reference_commands import FileKind, ListKind
 from twin.system.terminal import console, print_line, print_table

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import parse_toml
-from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
 from twin.cli.live_commands import start_page
 from twin.model.config import ModelConfig

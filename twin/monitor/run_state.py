@@ -15,7 +15,6 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.messages import format_record
 from table_io.records import (
     Agreement,
     Check,
@@ -35,6 +34,7 @@ from table_io.records import (
     Step,
     StepAdded,
     Timing,
+    format_record,
 )
 from twin.monitor.recent import WINDOW_S, RecentSamples
 from twin.monitor.traces import TraceBuffer

@@ -10,7 +10,7 @@ from rich.text import Text
 from table_io.block import Label
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import replace_nonprintable
-from table_io.messages import LABEL_TEXTS
+from table_io.records import LABEL_TEXTS
 from twin.monitor import curves, panels
 from twin.monitor.panels import (
     BAD_STYLE,

@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
-from table_io.messages import format_kind
+from table_io.records import format_kind
 from twin.drawing.plot_style import FIGURE_WIDTH_IN, RC_PARAMS
 from twin.report.figures import draw_figures
 from twin.report.report import format_headline

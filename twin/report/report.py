@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from table_io.messages import format_kind
 from table_io.records import (
     Agreement,
     Check,
@@ -22,6 +21,7 @@ from table_io.records import (
     SampleGap,
     Timing,
     Trip,
+    format_kind,
 )
 from twin.compare.pipeline import EVENT_KINDS
 from twin.drawing.page import embed_images, format_significant, render_page

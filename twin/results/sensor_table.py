@@ -6,9 +6,8 @@ from typing import Any
 from pydantic import ValidationError
 
 from table_io.config.base import ConfigT
-from table_io.config.calibration_record import CalibrationRecord
 from table_io.config.channel import read_channels
-from table_io.config.sensor import SensorConfig
+from table_io.config.sensor import CalibrationRecord, SensorConfig
 from table_io.records import RunStart
 from twin.results.summary import parse_toml_tables
 

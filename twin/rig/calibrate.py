@@ -13,12 +13,11 @@ from table_io.backends import MachineLost
 from table_io.block import Float1D
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import PROFILES_DIR
-from table_io.config.calibration_fit import MeanVoltage, fit_calibration, mean_voltage
-from table_io.config.calibration_record import CalibrationRecord, format_calibration_toml
+from table_io.config.calibration import MeanVoltage, fit_calibration, mean_voltage
 from table_io.config.folders import find_config
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
-from table_io.config.sensor import SensorConfig
+from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calibration_toml
 from table_io.errors import InputError, suggest
 from twin.rig.check_table import EXIT_FAILED, make_machine
 from twin.security.access_control import user_name

@@ -9,11 +9,11 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from table_io.adaptive import describe_adaptive_test
+from table_io.adaptive.policy import describe_adaptive_test
 from table_io.backends import open_backend
 from table_io.block import Label
 from table_io.clock import ManualClock, local_datetime
-from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.excitation.stepped_sine import Sweep

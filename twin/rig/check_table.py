@@ -26,7 +26,7 @@ from table_io.backends import (
 from table_io.block import Float2D
 from table_io.clock import Clock, ManualClock, RealClock, local_datetime
 from table_io.config.base import PROFILES_DIR, load_config
-from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.config.folders import find_config
 from table_io.config.profile import AcquisitionConfig, Profile
 from table_io.config.rig import RigConfig

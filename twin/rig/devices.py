@@ -16,10 +16,9 @@ from rich.table import Table
 
 from table_io.backends import DeviceSearch, DiscoveredDevice, check_reachable, get_descriptor
 from table_io.clock import RealClock
-from table_io.config.backend import BACKEND_GROUP
 from table_io.config.folders import list_configs
 from table_io.config.plugins import list_entry_points
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BACKEND_GROUP, RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from twin.system.terminal import console, print_line, print_table

@@ -14,7 +14,7 @@ import numpy as np
 from table_io.backends import open_backend
 from table_io.block import Float1D
 from table_io.clock import ManualClock
-from table_io.config.excitation.backbone import Backbone
+from table_io.config.excitation.continuation import Backbone
 from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig

@@ -14,7 +14,6 @@ from rich.progress import (
 
 from table_io.block import Block
 from table_io.errors import replace_nonprintable
-from table_io.messages import format_kind, format_record
 from table_io.records import (
     Check,
     Comparison,
@@ -27,6 +26,8 @@ from table_io.records import (
     StepAdded,
     Timing,
     Trip,
+    format_kind,
+    format_record,
 )
 from table_io.units import GRAVITY_M_S2
 from twin.system.terminal import console

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from table_io.block import Block, Float2D, Label
-from table_io.messages import LABEL_TEXTS
 from table_io.records import (
+    LABEL_TEXTS,
     Agreement,
     Comparison,
     CycleExtremes,

@@ -15,7 +15,6 @@ from table_io.block import Block, Float1D, Int1D, join_contiguous
 from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
-from table_io.messages import format_record
 from table_io.records import (
     Agreement,
     Comparison,
@@ -28,6 +27,7 @@ from table_io.records import (
     Record,
     RunStart,
     Timing,
+    format_record,
 )
 from twin.recording.reader import Recording
 from twin.viewer.address import viewer_url

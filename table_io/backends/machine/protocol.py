@@ -25,8 +25,7 @@ import numpy as np
 from pydantic import Field
 
 from table_io.block import Float1D
-from table_io.config.backend import BackendConfig
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError
 
 

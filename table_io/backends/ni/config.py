@@ -6,9 +6,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.backend import BackendConfig
 from table_io.config.base import ConfigModel, NonNegative, Positive, list_duplicates
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError
 
 HEARTBEAT_NAME = "heartbeat"  # name of the line that reads the heartbeat back

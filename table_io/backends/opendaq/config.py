@@ -2,9 +2,8 @@
 
 from pydantic import Field, field_validator
 
-from table_io.config.backend import BackendConfig
 from table_io.config.base import list_duplicates
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError
 
 NATIVE_SCHEME = "daq.nd://"

@@ -19,9 +19,8 @@ from table_io.backends.udp.packets import (
     encode_rig_packet,
 )
 from table_io.clock import Clock, RealClock
-from table_io.config.backend import BackendConfig
 from table_io.config.base import Positive
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError
 
 

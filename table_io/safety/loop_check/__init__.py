@@ -15,7 +15,7 @@ import numpy as np
 from table_io.block import Block
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.frf import evaluate_gain, evaluate_transfer
+from table_io.control.order_tracking import evaluate_gain, evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import Check, FrequencyResponse

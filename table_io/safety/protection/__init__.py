@@ -23,7 +23,7 @@ import numpy as np
 from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.frf import evaluate_transfer
+from table_io.control.order_tracking import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.records import FrequencyResponse
 from table_io.safety.protection.confirmation import (

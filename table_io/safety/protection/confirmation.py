@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.control.frf import evaluate_transfer
+from table_io.control.order_tracking import evaluate_transfer
 from table_io.records import FrequencyResponse
 from table_io.safety.protection import cycle_checks, load_cells
 from table_io.safety.protection.cycle import DriveCycle, ProtectionContext, Suspicion

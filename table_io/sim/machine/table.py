@@ -34,11 +34,10 @@ from table_io.backends.machine.protocol import (
 )
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock, ManualClock
-from table_io.config.backend import REINSTALL
 from table_io.config.base import ConfigModel, Positive
 from table_io.config.plugins import list_entry_points, load_entry_point
 from table_io.config.profile import Specimen
-from table_io.config.rig import OutputConfig, RigConfig
+from table_io.config.rig import REINSTALL, OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
 from table_io.sim.config import SimulatedTableConfig

@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from table_io.acquisition.alignment_messages import format_alignment
-from table_io.acquisition.drive_alignment import fit_alignment, interpolate_drive
 from table_io.acquisition.drive_follower import (
     REST_INDEX,
     DriveFollower,
     advance_follower,
+    fit_alignment,
+    format_alignment,
+    interpolate_drive,
     take_drive_indices,
 )
 from table_io.block import Float1D, Int1D

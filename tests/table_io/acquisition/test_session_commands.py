@@ -11,10 +11,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from table_io import sequencer
-from table_io.acquisition.event_log import MAX_LATENESS_S, EventLog
 from table_io.acquisition.output_queue import DECISION_S, OutputQueue
 from table_io.acquisition.session import (
     COMMAND_DELAY_S,
+    MAX_LATENESS_S,
+    EventLog,
     OperatorCommand,
     SessionSetup,
     find_gaps,
@@ -23,7 +24,7 @@ from table_io.acquisition.session import (
 from table_io.backends import MachineLost
 from table_io.block import Block, Float2D, Label, join_blocks
 from table_io.clock import ManualClock, local_datetime
-from table_io.config.calibration_due import find_overdue_calibrations
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.adaptive import Decision, StepResult, describe_adaptive_test, make_policy
 from table_io.adaptive.jump_refinement import choose_part
+from table_io.adaptive.policy import describe_adaptive_test, make_policy
 from table_io.adaptive.resonance_tracking import interpolate_phase_crossing, parabola_vertex
-from table_io.adaptive.result import mean_swing
+from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Block, Float1D, Label
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.profile import Profile

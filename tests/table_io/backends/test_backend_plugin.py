@@ -14,11 +14,10 @@ import pytest
 
 from table_io.backends import find_descriptor, open_backend, open_source
 from table_io.clock import ManualClock
-from table_io.config.backend import BACKEND_GROUP, load_backend
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.plugins import list_entry_points
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
+from table_io.config.rig import BACKEND_GROUP, RigConfig, load_backend
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SIMULATOR_GROUP, find_simulator
@@ -47,7 +46,7 @@ measured_cycles = 2
 """
 ACQUIRES = """
 from table_io.backends import BackendDescriptor
-from table_io.config.backend import BackendConfig
+from table_io.config.rig import BackendConfig
 
 class Inputs:
     def __init__(self, rig, rate_hz, clock):
@@ -254,7 +253,7 @@ def test_rig_files_are_read_without_any_vendor_library() -> None:
     code = (
         "import sys\n"
         "from table_io.config.base import PROFILES_DIR\n"
-        "from table_io.config.rig_file import load_rig\n"
+        "from table_io.config.rig import load_rig\n"
         "rigs = [load_rig(path)[0] for path in (PROFILES_DIR / 'rigs').glob('*.toml')]\n"
         "assert len({rig.backend for rig in rigs}) == 5\n"
         "late = {'nidaqmx', 'grpc', 'opendaq', 'table_io.sim.simulated_table', 'numba'}\n"

@@ -5,12 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from table_io.config.calibration_fit import (
-    CalibrationFit,
-    MeanVoltage,
-    fit_calibration,
-    mean_voltage,
-)
+from table_io.config.calibration import CalibrationFit, MeanVoltage, fit_calibration, mean_voltage
 from table_io.errors import InputError
 
 SENSITIVITY, OFFSET = 0.13, -0.4  # volts = SENSITIVITY (value + OFFSET)

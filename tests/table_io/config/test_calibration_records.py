@@ -11,11 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.calibration_due import find_overdue_calibrations
-from table_io.config.calibration_record import CalibrationRecord, format_calibration_toml
+from table_io.config.calibration import find_overdue_calibrations
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
-from table_io.config.sensor import SensorConfig
+from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calibration_toml
 from table_io.errors import InputError
 
 TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")

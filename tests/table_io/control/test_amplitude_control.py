@@ -20,8 +20,7 @@ from table_io.control.amplitude_control import (
     is_within_tolerance,
     update_target,
 )
-from table_io.control.frf import evaluate_transfer
-from table_io.control.order_tracking import HarmonicFit, track_harmonics
+from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import FrequencyResponse, Level, Record, RunStart, Step
 from table_io.units import GRAVITY_M_S2

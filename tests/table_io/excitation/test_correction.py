@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from table_io.block import Label
-from table_io.excitation.correction import NO_CORRECTION, Correction
-from table_io.excitation.drive import Drive
+from table_io.excitation.drive import NO_CORRECTION, Correction, Drive
 from table_io.excitation.trajectory import SineTarget, Trajectory
 
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Label
-from table_io.excitation.correction import Correction
 from table_io.excitation.drive import (
     MAX_BLEND_CURVATURE,
     MAX_BLEND_SLOPE,
     RAMP_CYCLES,
     RAMP_S,
+    Correction,
     Drive,
     HistorySegment,
     Segment,

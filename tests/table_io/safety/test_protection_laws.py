@@ -19,7 +19,7 @@ from table_io.block import Block, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.profile import Profile, ProtectionConfig, Specimen
 from table_io.config.rig import RigConfig
-from table_io.control.frf import evaluate_transfer
+from table_io.control.order_tracking import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import FrequencyResponse

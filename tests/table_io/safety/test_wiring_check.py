@@ -13,8 +13,8 @@ from table_io.safety.wiring_check import (
     RestingInputs,
     check_resting_inputs,
     check_zero_command,
+    fit_mains_hum,
 )
-from table_io.safety.wiring_check.mains_hum import fit_mains_hum
 
 RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 RATE, SAMPLES = 2000.0, 8000
