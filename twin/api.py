@@ -26,8 +26,8 @@ from twin.discovery.loading import load_logs, load_recordings
 from twin.discovery.parameters import get_log
 from twin.discovery.serialize import model_to_toml, parameter_to_json, verdict_to_json
 from twin.exchange.import_table import ImportOptions, import_samples
+from twin.laws.library import find_effect
 from twin.log import Log, open_log
-from twin.model.effects import find_effect
 from twin.replay.pipeline_replay import RecordedRun, SampleRange, replay_recording
 from twin.results.contracts import Interval, Verdict
 from twin.results.recordings import read_recorded_config

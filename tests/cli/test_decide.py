@@ -19,7 +19,7 @@ from twin.discovery import discover_command as discover
 from twin.discovery.decide_command import DecideOptions, parse_options, play_decisive_tests
 from twin.discovery.discover_command import judge_logs
 from twin.discovery.serialize import Json
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_run_config

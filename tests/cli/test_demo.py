@@ -21,7 +21,7 @@ from twin.demo.command import (
     open_seal,
     seal_effect,
 )
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 
 
 def read_table(path: Path) -> SimulatedTableConfig:

@@ -26,7 +26,7 @@ from twin.discovery.loading import load_logs
 from twin.discovery.selection import Cancelled
 from twin.discovery.serialize import REFITTED_SUFFIX
 from twin.exchange.import_table import import_samples
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_model_template, read_run_config

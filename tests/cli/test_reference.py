@@ -21,7 +21,7 @@ from twin.cli.examples import EXAMPLES
 from twin.cli.main import app
 from twin.cli.reference_commands import FileKind
 from twin.guide.reference_command import build_file_schema
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 
 KEY = re.compile(r"(# )?\w+ = ")  # at the start of a line, perhaps commented out
 

@@ -9,7 +9,7 @@ from table_io.block import recut_blocks
 from tests.compare.test_twins import G4, RATE_HZ, measured, run_twins, shaken, track
 from twin.compare.sensors import delay_signal
 from twin.compare.twins import TwinSetup, advance_twins
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import Model
 from twin.transport.codec import encode_item
 

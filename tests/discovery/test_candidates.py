@@ -6,7 +6,7 @@ import pytest
 from tests.discovery.test_parameters import SCALE
 from twin.discovery.candidates import Candidate
 from twin.discovery.parameters import SLIP_SPEED
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 
 
 def test_an_appendage_is_tried_at_every_frequency_of_the_record() -> None:

@@ -32,7 +32,7 @@ from twin.discovery.selection import (
     revise_step,
 )
 from twin.discovery.verdict import closed_fraction, judge_selection
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 
 
 @cache

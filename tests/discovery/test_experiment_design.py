@@ -42,7 +42,7 @@ from twin.discovery.verdict import (
     DiscoveryVerdict,
     widen_for_form,
 )
-from twin.model.effects.effect_file import build_written_effect
+from twin.laws.effect_file import read_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 from twin.model.solver import OUTPUT_COUNT
@@ -266,7 +266,7 @@ high = 1e12
 vanishing = 0.0
 typical = 1e7
 """
-    effect = build_written_effect(text)
+    effect = read_effect(text)
     model = Model(SNM.base, (EffectInstance.create(effect, {"k": 2e8}),))
     test = make_test(2.0, 2.0, 0.05, cycles=10)
     problem = prepare_problem([record_model(model, test.motion)], model)

@@ -15,7 +15,7 @@ from twin.discovery.law_terms import FAMILIES, LAW_PREFIX, list_law_candidates
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import EffectKey
 from twin.discovery.symbolic_regression import make_term
-from twin.model.effects.expression import parse_unit
+from twin.laws.expression import parse_unit
 
 
 def search(truth):
@@ -63,7 +63,7 @@ class TestExpressions:
     def test_coefficients_that_the_amplitude_holds_are_fixed(self):
         term = self.make("tanh(8.0 * X2) * abs(-3.0 * X1)")
         assert term is not None
-        assert term.effect.law.force == "k * (tanh(c1 * (v / v0)) * abs(-c2 * (u / u0)))"
+        assert term.effect.force == "k * (tanh(c1 * (v / v0)) * abs(-c2 * (u / u0)))"
         assert [free.key.name for free in term.free] == ["k", "c1"]
         assert term.shapes == ((8.0,),)
         assert term.constants[EffectKey(term.name, "c2")] == 3.0
@@ -71,7 +71,7 @@ class TestExpressions:
     def test_squares_are_powers(self):
         term = self.make("square(X1) * X2")
         assert term is not None
-        assert term.effect.law.force == "k * ((u / u0) ** 2 * (v / v0))"
+        assert term.effect.force == "k * ((u / u0) ** 2 * (v / v0))"
 
     def test_a_bumper_that_pushes_at_touch_is_no_law(self):
         assert self.make("X1 + 0.5", "bumpers") is None
@@ -199,7 +199,7 @@ def test_a_law_is_found_beside_the_errors_of_instruments():
     assert proposal is not None
     assert proposal.is_sufficient
     (law,) = proposal.laws
-    (parameter,) = law.parameters.values()
+    (parameter,) = law.parameters
     assert "**3" in law.force
     assert parameter.typical == pytest.approx(4e4, rel=0.05)
 
@@ -221,7 +221,7 @@ class TestProposal:
         _, proposal = propose_law(discovery)
         assert proposal is not None
         (law,) = proposal.laws
-        (parameter,) = law.parameters.values()
+        (parameter,) = law.parameters
         assert f"**{exponent}" in law.force
         assert parse_unit(parameter.unit) == parse_unit(unit)
         assert parameter.typical == pytest.approx(value, rel=0.05)

@@ -27,7 +27,7 @@ from twin.discovery.parameters import (
     list_effect_parameters,
     size_of_unit,
 )
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import SensorModel
 
 SCALE = RecordScale(

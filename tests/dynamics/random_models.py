@@ -18,7 +18,7 @@ from tests.model.laboratory_laws import SLIP_DAMPER, ZENER_DAMPER
 from twin.dynamics.diagram import Diagram, compute_diagram, reduce_period
 from twin.dynamics.orbits import Orbit, find_orbit, motion_size
 from twin.dynamics.period_map import make_period_map
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 

@@ -14,7 +14,7 @@ from twin.dynamics.continuation import continue_branch
 from twin.dynamics.event_driven_map import EventDrivenMap
 from twin.dynamics.orbits import settle_to_orbit
 from twin.dynamics.period_map import ClosedFormPeriodMap, make_period_map
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import Model
 
 START = {"u": 5e-4, "v": 0.05}

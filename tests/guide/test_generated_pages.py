@@ -19,8 +19,8 @@ from twin.guide.loops import compute_loops, find_loops
 from twin.guide.notebook import convert_notebook, list_code
 from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
-from twin.model.effects import EFFECTS
-from twin.model.effects.effect import Effect
+from twin.laws.effect import Effect
+from twin.laws.library import EFFECTS
 from twin.results.contracts import FeatureVerdict
 
 

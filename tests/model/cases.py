@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from tests.model.reference import AG, snm
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 from twin.model.model import Model
 from twin.model.solver import StateEstimate
 

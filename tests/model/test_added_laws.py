@@ -23,10 +23,10 @@ from twin.discovery.discover import discover_effects
 from twin.discovery.parameters import EffectKey
 from twin.dynamics.period_map import make_period_map
 from twin.dynamics.stroboscopic import OperatingPoint, make_stroboscopic_map
-from twin.model.effects import find_effect, load_plugins
-from twin.model.effects.effect import Effect
-from twin.model.effects.effect_file import EffectFile
-from twin.model.effects.law import find_law_problem
+from twin.laws.checks import check_effect
+from twin.laws.effect import Effect, EffectParameter, State
+from twin.laws.effect_file import EffectFile
+from twin.laws.library import find_effect, load_plugins
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import EffectInstance, Model
 from twin.model.solver import StateEstimate
@@ -40,6 +40,10 @@ SAME_LAWS = [
     ("slip_damper", "bouc_wen", ("force", "yield_displacement")),
     ("deep_dashpot", "hunt_crossley", ("ch",)),
     ("rocking", "table_tilt", ("tilt",)),
+    ("dry_friction", "coulomb_friction", ("fc",)),
+    ("sticky_bumper", "adhesion", ("force",)),
+    ("opening_gaps", "gap_drift", ("rate",)),
+    ("misplaced_mass", "gap_offset", ("offset",)),
 ]
 
 
@@ -279,22 +283,48 @@ LAW = laboratory_laws.ZENER_BUMPER
 
 
 @pytest.mark.parametrize(
-    ("effect", "problem"),
+    ("effect", "key", "words"),
     [
-        (replace(LAW, force=None), "no `force`"),
-        (replace(LAW, place="table"), "'table'"),  # type: ignore[arg-type]
-        (replace(LAW, rates=None), "belong together"),
-        (replace(LAW, rates=lambda q, w, s, c: (0.0, 0.0)), "2 values for 1 states"),
-        (replace(LAW, force=lambda q, w, s, c: -w * abs(w)), "not linear in the rate"),
-        (replace(LAW, force=lambda q, w, s, c: 5.0), "zero at deformation 0"),
-        (replace(LAW, force=lambda q, w, z, c: 0.0), "argument 'z'"),
-        (replace(LAW, force=lambda q, w, s, c: s[3]), "IndexError"),
-        (replace(LAW, force=lambda q, w, s, c: float("nan")), "not finite"),
+        (replace(LAW, force="", states={}), "force", "does nothing"),
+        (replace(LAW, place="table"), "place", "no place"),  # type: ignore[arg-type]
+        (replace(LAW, force=lambda w, c: c[0] * w), "force", "not an expression"),  # type: ignore[arg-type]
+        (replace(LAW, force="b + stiffness * w"), "force", "'w' is unknown"),
+        (replace(LAW, force="stiffness * b"), "force", "unit"),
+        (replace(LAW, states={"b": State("N", "stiffness * d")}), "states.b.rate", "unit"),
+        (
+            replace(LAW, force="-stiffness * relaxation_time * v * tanh(d / (d - d))", states={}),
+            "force", "not finite",
+        ),
+        (
+            replace(LAW, force="-stiffness * relaxation_time * v * abs(tanh(v / abs(v)))"),
+            "force", "not finite",
+        ),
+        (replace(LAW, force="stiffness * y", place="input"), "states", "no states"),
+        (replace(LAW, break_away="stiffness * relaxation_time"), "break_away", "another place"),
+        (replace(LAW, changes={"gap": "relaxation_time"}), "changes.gap", "no base parameter"),
+        (replace(LAW, parameters=LAW.parameters[1:]), "parameters", "vanish"),
     ],
+)  # fmt: skip
+def test_a_law_that_cannot_work_is_told_why(effect, key, words):
+    check_effect(LAW)
+    with pytest.raises(InputError) as caught:
+        check_effect(effect)
+    assert caught.value.key == key
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("force", "words"),
+    [("-k * v * abs(v) / s", "not linear in the rate"), ("k * s", "zero at deformation 0")],
 )
-def test_a_law_that_cannot_work_is_told_why(effect, problem):
-    assert not find_law_problem(LAW)
-    assert problem in find_law_problem(effect)
+def test_a_bumper_law_that_the_solver_cannot_integrate_is_refused(force, words):
+    parameters = (
+        EffectParameter("k", "N s/m", 0.0, 1e9, 0.0, 1.0),
+        EffectParameter("s", "m/s", 1e-3, 1.0, None, 0.1),
+    )
+    with pytest.raises(InputError) as caught:
+        check_effect(Effect(id="x", parameters=parameters, place="bumpers", force=force))
+    assert words in str(caught.value)
 
 
 @pytest.mark.usefixtures("drafts")

@@ -8,7 +8,7 @@ import pytest
 from tests.input_errors import raises_input_error
 from tests.model.cases import FORCES, RATE_HZ, drive, everything, having, noisy, typical, vanishing
 from tests.model.reference import snm
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 from twin.model.model import Model
 
 TABLE = {
@@ -181,13 +181,13 @@ def test_a_lost_sample_makes_everything_after_it_nan(effect, bad):
 
 
 def test_asymmetry_keeps_the_mean_stiffness():
-    applied = BY_ID["bumper_asymmetry"].apply(snm(), {"ratio": 1.5})
+    applied = Model(snm()).with_effect("bumper_asymmetry", ratio=1.5).parameters
     assert applied.bumper_stiffness_r / applied.bumper_stiffness_l == pytest.approx(1.5)
     assert applied.bumper_stiffness_r + applied.bumper_stiffness_l == pytest.approx(1.02e6)
 
 
 def test_offset_keeps_the_total_gap():
-    applied = BY_ID["gap_offset"].apply(snm(), {"offset": 3e-4})
+    applied = Model(snm()).with_effect("gap_offset", offset=3e-4).parameters
     assert (applied.gap_r, applied.gap_l) == pytest.approx((2.3e-3, 1.7e-3))
 
 

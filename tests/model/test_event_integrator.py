@@ -10,7 +10,7 @@ from tests.model.cases import FORCES, drive, having, noisy, typical
 from tests.model.independent_solution import Witness
 from tests.model.motion import sine
 from tests.model.reference import snm
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.event_integrator_kernel import (
     DIRECTION,
     STATE_B_L,
@@ -100,7 +100,11 @@ def test_order_of_convergence_through_events(effect):
 
 def energy(model: Model, state: np.ndarray) -> float:
     """All that is stored in J, from the laws' own potentials."""
-    p, value = model.parameters, lambda *key: model.effect_parameter(*key) or 0.0
+    p, values = model.parameters, model.flatten()
+
+    def value(effect: str, parameter: str) -> float:
+        return values.get(f"{effect}.{parameter}", 0.0)
+
     u, v, sides = state[0], state[1], (abs(state[2]), abs(state[3]))
     total = 0.5 * p.mass * v * v + 0.5 * p.stiffness * u * u
     total += 0.25 * value("cubic_stiffness", "k3") * u**4
@@ -170,7 +174,7 @@ def test_friction_stops_a_free_mass_for_good():
 
 def test_hysteresis_does_not_depend_on_speed():
     """The closed form against a fine Euler walk of the law, and at a thousandth of the speed."""
-    from twin.model.effects.bouc_wen import hysteretic_variable
+    from twin.model.force_laws import hysteretic_variable
 
     way = 3e-3 * np.cumsum(np.random.default_rng(5).standard_normal(40))
     z = walked = 0.0

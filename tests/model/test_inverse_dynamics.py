@@ -5,7 +5,7 @@ import pytest
 
 from tests.model.cases import FORCES, RATE_HZ, drive, having
 from tests.model.motion import sine
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model
 from twin.model.solver import StateEstimate

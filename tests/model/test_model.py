@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from importlib import metadata
 
 import numpy as np
@@ -15,21 +16,16 @@ from tests.input_errors import raises_input_error
 from tests.model.cases import RATE_HZ, drive, everything, having, noisy
 from tests.model.reference import AG, snm
 from tests.model.test_parameters import CARD
+from twin.laws.effect import Effect, EffectParameter
+from twin.laws.library import find_effect
 from twin.model.closed_form import ClosedFormSolver
 from twin.model.config import ModelConfig
-from twin.model.effects import EFFECTS, find_effect
-from twin.model.effects.effect import Effect, EffectParameter
-from twin.model.effects.law import find_law_problem
 from twin.model.event_integrator import EventDrivenSolver
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model, SensorModel
 from twin.model.solver import StateEstimate
 
 G4 = Specimen(mass_kg=550.0, gap_mm=4.0)
-
-
-def quintic(q: float, w: float, c: tuple[float, ...]) -> float:
-    return c[0] * q**5 + c[1] * w * q * q
 
 
 QUINTIC = Effect(
@@ -39,15 +35,10 @@ QUINTIC = Effect(
         EffectParameter("k5", "N/m5", 0.0, 1e14, 0.0, 1e12, "Quintic coefficient."),
         EffectParameter("c", "N s/m3", 0.0, 1e9, 0.0, 1e7, "Loss with it."),
     ),
-    acts="force",
+    force="k5 * u**5 + c * v * u * u",
     residual="fifth harmonic",
     confused_with=("cubic_stiffness",),
-    force=quintic,
 )
-
-
-def cube(q: float, c: tuple[float, ...]) -> float:
-    return c[0] * q * q * q
 
 
 def install_effects(monkeypatch, *effects):
@@ -85,8 +76,7 @@ def test_a_plug_in_adds_a_force(monkeypatch):
 
 def test_plug_ins_that_repeat_a_built_in_law_agree_with_it_and_keep_apart(monkeypatch):
     ours = find_effect("cubic_stiffness")
-    theirs = Effect("their_cubic", "k3 u^3", ours.parameters, "force", "x", ("bouc_wen",),
-                    force=cube)  # fmt: skip
+    theirs = replace(ours, id="their_cubic", compiled={})
     install_effects(monkeypatch, QUINTIC, theirs)
     first = Model(snm()).with_effect("cubic_stiffness", k3=1e7)
     two = Model(snm()).with_effect("their_cubic", k3=1e7)
@@ -101,8 +91,10 @@ def test_plug_ins_that_repeat_a_built_in_law_agree_with_it_and_keep_apart(monkey
     [
         (ImportError("no module"), "no module"),
         ("text", "got str"),
-        (Effect("x", "x", (), "force", "x", ()), "`force`"),
-        (Effect("x", "x", (), "linear", "x", ()), "acts = 'linear'"),
+        (replace(QUINTIC, force=""), "does nothing"),
+        (replace(QUINTIC, force=lambda q, c: c[0] * q), "not an expression"),  # type: ignore[arg-type]
+        (replace(QUINTIC, compiled={"k3": "k5"}), "`compiled`"),
+        (replace(QUINTIC, place="sensor"), "sensors"),
     ],
 )
 def test_a_bad_plug_in_is_named(monkeypatch, effect, problem):
@@ -262,14 +254,6 @@ def test_a_sampled_sweep_takes_as_many_samples_as_a_hard_bumper_needs():
     assert model.min_rate_hz > 1000 * 1.4
     assert got[..., :2] == pytest.approx(want[..., :2], rel=1e-4)
     assert got[..., 6:].tolist() == want[..., 6:].tolist()
-
-
-def test_every_built_in_effect_is_on_a_path():
-    for effect in EFFECTS:
-        assert (effect.change is not None) == (effect.acts == "parameters")
-        assert (effect.force is None) <= (effect.states == ())
-        assert effect.force is None or effect.acts == "force"
-        assert effect.acts != "force" or not find_law_problem(effect) or effect.force is None
 
 
 @pytest.mark.parametrize("effect", [None, "gap_drift"])

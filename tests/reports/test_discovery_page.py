@@ -28,9 +28,9 @@ from twin.discovery.parameters import GapKey
 from twin.discovery.serialize import Json, verdict_to_json
 from twin.drawing.page import format_significant
 from twin.drawing.plot_style import RC_PARAMS
+from twin.laws.typesetting import typeset_law
 from twin.live.run_command import list_model_warnings
 from twin.model.config import ModelConfig
-from twin.model.effects.typesetting import typeset_law
 from twin.model.inverse_dynamics import forces_along
 from twin.setup.run_config import read_model_template, read_run_config
 from twin.setup.unpaced import play_unpaced

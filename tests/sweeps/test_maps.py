@@ -19,7 +19,7 @@ from tests.input_errors import raises_input_error
 from tests.sweeps.small_study import STUDY, TEST, make_stored_study, write_study
 from twin.api import open_study
 from twin.compare.curves import detect_hysteresis
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.results.ideal_points import compute_prc_points

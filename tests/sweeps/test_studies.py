@@ -20,7 +20,7 @@ from table_io.config.profile import Profile
 from tests.input_errors import raises_input_error
 from twin.cli.report import write_folder_report
 from twin.cli.simulate import simulate_profile
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.report.finalize import EXIT_INTERRUPTED

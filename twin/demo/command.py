@@ -34,8 +34,8 @@ from twin.drawing.plot_style import (
     twin_style,
 )
 from twin.drawing.prc_drawing import break_at_jumps, plot_prc
+from twin.laws.library import find_effect
 from twin.live.run_command import run_test
-from twin.model.effects import find_effect
 from twin.results.report_data import extract_prc
 from twin.results.summary import parse_jumps, prc_points
 from twin.setup.folders import make_output_folder, make_run_folder

@@ -12,7 +12,6 @@ from itertools import product
 import numpy as np
 
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from twin.discovery.generic_terms import list_term_parameters, list_terms
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import (
     GENERIC_PREFIX,
@@ -20,12 +19,14 @@ from twin.discovery.parameters import (
     FreeParameter,
     ParameterKey,
     ParameterSet,
+    TermKey,
     list_effect_parameters,
     measure_size,
 )
 from twin.discovery.residuals import LogResiduals
-from twin.model.effects import EFFECTS, load_plugins
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
+from twin.laws.library import EFFECTS, load_plugins
+from twin.laws.terms import GENERIC_TERMS
 
 LADDER_LENGTH = 9
 # of the largest velocity: trial values; friction near zero velocity varies
@@ -98,13 +99,24 @@ class Candidate:
 
 
 def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Candidate, ...]:
-    """Return the generic terms as candidates."""
+    """Return the generic terms as candidates: amplitude in N, and width if it has one."""
     candidates, scale = [], log_residuals[0].scale
     has_contact = any((residuals.contact_state > 0).any() for residuals in log_residuals)
-    for name, ladder in list_terms(has_contact):
-        free = list_term_parameters(name, ladder, scale)
-        shapes = tuple((width,) for width in ladder) or ((),)
-        candidates.append(Candidate(f"{GENERIC_PREFIX}.{name}", free, free[0], 0.0, shapes))
+    for term in GENERIC_TERMS.values():
+        if term.place != "damper" and not has_contact:
+            continue
+        free = [
+            FreeParameter(
+                TermKey(term.name, "force"), -np.inf, np.inf, scale.force, "N", vanishing=0.0
+            )
+        ]
+        for ladder in term.shapes.values():
+            low, high = 0.3 * ladder[0], 3.0 * ladder[-1]
+            key = TermKey(term.name, "width")
+            free.append(FreeParameter(key, low, high, ladder[0], "", logarithmic=True))
+        name = f"{GENERIC_PREFIX}.{term.name}"
+        shapes = tuple(product(*term.shapes.values()))
+        candidates.append(Candidate(name, tuple(free), free[0], 0.0, shapes))
     return tuple(candidates)
 
 

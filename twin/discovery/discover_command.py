@@ -43,8 +43,8 @@ from twin.discovery.serialize import (
     verdict_to_json,
 )
 from twin.discovery.symbolic_regression import MISSING_MESSAGE, is_available
+from twin.laws.library import find_effect
 from twin.model.config import ModelConfig
-from twin.model.effects import find_effect
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.contracts import Verdict
 from twin.results.quantities import format_quantity

@@ -28,7 +28,7 @@ from twin.discovery.features.search import (
 )
 from twin.discovery.features_page import write_features_page
 from twin.discovery.features_summary import discovery_to_json, feature_model_to_toml
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.contracts import FeatureVerdict
 from twin.results.summary import Json, dump_contract

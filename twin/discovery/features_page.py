@@ -7,8 +7,8 @@ from twin.discovery.features.search import FeatureDiscovery, describe_effects
 from twin.discovery.features_figures import draw_feature_pairs
 from twin.discovery.headline import name_effect
 from twin.drawing.page import embed_images, render_page
-from twin.model.effects import find_effect
-from twin.model.effects.typesetting import typeset_law
+from twin.laws.library import find_effect
+from twin.laws.typesetting import typeset_law
 from twin.results.quantities import format_quantity
 from twin.results.summary import Json
 

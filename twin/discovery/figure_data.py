@@ -21,7 +21,6 @@ from twin.discovery.motion import MeasuredMotion
 from twin.discovery.parameters import GENERIC_PREFIX, ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet
-from twin.model.effects.effect_file import WrittenEffect
 
 MIN_ENTRIES = 20  # of a step in a residual row, for a close-up
 CLOSE_UP_CYCLES = 2
@@ -163,8 +162,8 @@ class DiscoveryView:
 
 def format_term(term: Candidate) -> str:
     """Return the name of an effect for a reader; a term outside the library is called generic."""
-    if isinstance(term.effect, WrittenEffect):
-        return f"{term.effect.law.title}: {term.effect.law.force}"
+    if term.effect is not None and term.effect.is_of_file:
+        return f"{term.effect.title}: {term.effect.force}"
     if term.effect is not None:
         return term.name
     return f"generic term {term.name.removeprefix(f'{GENERIC_PREFIX}.')} (no effect of the library)"

@@ -1,8 +1,8 @@
 """Headline of a discovery in words of physics, with the typeset law of each effect."""
 
 from twin.discovery.serialize import REFITTED_SUFFIX, Json
-from twin.model.effects import describe_effect, find_effect
-from twin.model.effects.typesetting import typeset_law
+from twin.laws.library import find_effect
+from twin.laws.typesetting import typeset_law
 from twin.results.quantities import format_quantity
 
 MAX_EXCLUDED = 3  # rivals that the headline names
@@ -21,7 +21,7 @@ def format_effect(effect: Json) -> str:
 
 def name_effect(effect: Json) -> str:
     """Return an effect in words of physics, with the channel of a sensor effect."""
-    words = describe_effect(find_effect(effect["id"]))
+    words = find_effect(effect["id"]).summary
     words = words if words[1:2].isupper() else words[0].lower() + words[1:]
     words = words if effect["id"] not in PROPER_NAMES else words[0].upper() + words[1:]
     return f"{words} of {effect['channel']}" if effect.get("channel") else words

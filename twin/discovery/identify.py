@@ -49,7 +49,7 @@ from twin.discovery.parameters import (
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import SelectionProblem
 from twin.discovery.signals import LogSignals
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import Model
 
 WINDOW_S = 1.0

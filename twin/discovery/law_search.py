@@ -38,8 +38,7 @@ from twin.discovery.selection import (
 )
 from twin.discovery.symbolic_regression import list_symbolic_candidates
 from twin.discovery.verdict import closed_fraction
-from twin.model.effects.effect import Place
-from twin.model.effects.effect_file import EffectFile, WrittenEffect
+from twin.laws.effect import Effect, Place
 from twin.model.valid_range import list_inputs
 
 FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
@@ -55,14 +54,14 @@ MAX_WORSE_SHARE = 1e-4  # of the held-out squares, which no one would miss
 class LawProposal:
     """A law for what the library does not explain: the fitted set and how good it is.
 
-    `start` is the set to which its terms were added, `laws` an effect file for each term;
+    `start` is the set to which its terms were added, `laws` an effect for each term;
     `nearest` the effect of the library that does best alone. `by_class` are the best single terms
     of each class, best first.
     """
 
     fitted: FittedSet
     start: FittedSet
-    laws: tuple[EffectFile, ...]
+    laws: tuple[Effect, ...]
     floor: float
     nearest: str
     law_class: str
@@ -198,7 +197,7 @@ def refit_nuisances(
     fitted = widen_with_ideal(prepared, _round_exponents(imperfect.problem, refitted))
     terms = fitted.effects[len(law.start.effects) :]
     laws = tuple(
-        _describe_law(imperfect.problem, fitted, term, old.nearest)
+        _describe_law(imperfect.problem, fitted, term, law.nearest)
         for term, old in zip(terms, law.laws, strict=True)
     )
     return imperfect, replace(law, fitted=fitted, laws=laws, floor=min(law.floor, fitted.cost))
@@ -369,32 +368,24 @@ def _list_best_by_class(fitted_sets: Sequence[FittedSet]) -> tuple[tuple[str, Fi
 
 def _describe_law(
     problem: SelectionProblem, fitted: FittedSet, term: Candidate, nearest: str
-) -> EffectFile:
-    """Return the effect file of a fitted term: its values as typical ones, its measured range."""
-    assert isinstance(term.effect, WrittenEffect)
-    law = term.effect.law
-    values = {
-        name: fitted.fit.parameters.values[EffectKey(term.name, name)] for name in law.parameters
-    }
-    parameters = {
-        name: parameter.model_copy(
-            update={
-                "typical": values[name],
-                "low": min(parameter.low, values[name]),
-                "high": max(parameter.high, values[name]),
-            }
-        )
-        for name, parameter in law.parameters.items()
-    }
-    names = law.parsed_force.names.union(*(rate.names for rate in law.parsed_rates.values()))
+) -> Effect:
+    """Return the effect of a fitted term: its values as typical ones, its measured range."""
+    law = term.effect
+    assert law is not None
+    parameters = []
+    for own in law.parameters:
+        value = fitted.fit.parameters.values[EffectKey(term.name, own.name)]
+        low, high = min(own.low, value), max(own.high, value)
+        parameters.append(replace(own, typical=value, low=low, high=high))
     valid_range = measure_range(problem.log_residuals, fitted.fit.parameters, law.place)
-    return law.model_copy(
-        update={
-            "parameters": parameters,
-            "range": {name: valid_range[name] for name in valid_range if name in names},
-            "nearest": nearest,
-            "residual": f"A {law.title or 'law'} found where no effect of the library fits.",
-        }
+    return replace(
+        law,
+        parameters=tuple(parameters),
+        valid_range=tuple(
+            (name, *ends) for name, ends in valid_range.items() if name in law.used_names
+        ),
+        confused_with=(nearest,) if nearest else (),
+        residual=f"A {law.title or 'law'} found where no effect of the library fits.",
     )
 
 

@@ -1,15 +1,13 @@
-"""Terms of force laws that the library lacks, by class: the physical basis of a law search.
+"""Terms of a law search as candidates: rows of `twin.laws.terms` on the scale of a record.
 
-Each term is an effect of an effect file: an amplitude `k` in N and shapes, with reference values
-from the record, so that a search does not depend on the size of the specimen. A power of
-displacement or speed has a free exponent, which is rounded afterwards (see `law_search`).
+Each is an effect of an effect file: an amplitude and shapes, with reference values from the record.
+A power of displacement or speed has a free exponent, which is rounded afterwards (see
+`law_search`).
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import replace
 from itertools import product
-
-import numpy as np
 
 from twin.discovery.candidates import Candidate
 from twin.discovery.motion import RecordScale
@@ -20,15 +18,19 @@ from twin.discovery.parameters import (
     ParameterSet,
     list_effect_parameters,
 )
-from twin.model.effects.effect_file import (
-    EffectFile,
-    LawParameter,
-    LawPlace,
-    LawState,
-    WrittenEffect,
-    list_variables,
+from twin.laws.effect import Effect, EffectParameter, list_variables
+from twin.laws.expression import format_dimension, parse_unit
+from twin.laws.library import check_new_effect
+from twin.laws.terms import (
+    CONTACT,
+    EXPRESSION,
+    FAMILIES,
+    POSITIVE_UNITS,
+    REFERENCE_UNITS,
+    SHAPE_UNITS,
+    ForceTerm,
+    write_power,
 )
-from twin.model.effects.expression import format_dimension, parse_unit
 
 LAW_PREFIX = "law_"  # of the ids of proposed laws
 MAX_EXPONENT, MIN_EXPONENT = 12.0, 0.1
@@ -36,183 +38,6 @@ ROUND_EXPONENTS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0)
 SHAPE_MARGIN = 4.0  # ratio of the bounds of a shape to the ends of its ladder
 # A regularized friction steeper than this in speed cannot be integrated at the usual rates.
 MIN_SLIP_SHARE = 0.004  # of the largest velocity
-
-
-@dataclass(frozen=True, slots=True)
-class TermFamily:
-    """Family of force laws: expression, ladders of its shapes, references, states.
-
-    `shapes` gives trial values by name; `units` the unit of each shape and reference. A shape in
-    m, m/s or s is relative to the record's largest displacement (depth in a bumper), velocity or
-    the duration, as are the references: those named u0, v0, d0 and y0 are the largest values, w0
-    is the largest displacement and t0 the duration. `power` is (variable, is odd) of a power law;
-    `amplitude` the name and unit of the parameter with which the law vanishes.
-    """
-
-    name: str
-    law_class: str
-    place: LawPlace
-    force: str
-    shapes: Mapping[str, Sequence[float]]
-    power: tuple[str, bool] | None = None
-    states: Mapping[str, LawState] = field(default_factory=dict)
-    title: str = ""
-    amplitude: tuple[str, str] = ("k", "N")
-
-
-REFERENCE_UNITS = {"u0": "m", "v0": "m/s", "d0": "m", "y0": "m", "t0": "s"}
-SHAPE_UNITS = {
-    "p": "", "w": "m", "s": "m/s", "b": "m/s", "tau": "s", "n": "", "omega2": "1/s2",
-    "decay": "1/s", "cubic": "1/m2 s2", "mass": "kg",
-}  # fmt: skip
-POSITIVE_UNITS = ("kg", "N/m")  # of amplitudes that are positive in every passive law
-ODD_EXPONENTS, EVEN_EXPONENTS = (0.5, 1.5, 2.0, 3.0, 5.0, 8.0), (1.0, 2.0, 4.0)
-LENGTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
-STOPS = (0.1, 0.3, 0.5, 0.7, 0.85)
-YIELD_LENGTHS = (0.02, 0.06, 0.15, 0.4)
-SPEEDS = (0.006, 0.015, 0.05, 0.15, 0.5)
-TIMES = (0.1, 0.3, 1.0)
-RELAXATIONS = (3e-4, 1e-3, 3e-3, 1e-2)  # of the duration; see `list_law_candidates`
-CONTACT_TIMES = (1e-4, *RELAXATIONS)
-# Squares of the frequencies of resonators over that of the main motion; a resonance is narrow. On
-# the table it is that with the specimen held: spring and coupling together.
-RESONANCES = tuple(float(ratio) ** 2 for ratio in np.geomspace(0.3, 12.0, 34))
-RESONANCE_DECAYS = (0.15,)  # 2 z omega over the main angular frequency
-CUBIC_RESONANCES = tuple(float(ratio) for ratio in np.geomspace(0.1, 1e3, 44))
-MEMORYLESS, CONTACT, TABLE = "force in u and v", "bumper force", "force on the table's motion"
-MEMORY, DRIFT, RESONATOR = "internal state", "drift in time", "attached resonator"
-EXPRESSION = "free expression"  # of symbolic regression
-HYSTERESIS = {"z": LawState(unit="", rate="(v - abs(v) * z * abs(z)**(n - 1)) / w")}
-TOUCH = "min(max(100 * d / d0, 0), 1)"  # 1 in contact, 0 where a face is free: it relaxes to d = 0
-
-
-def _power(variable: str, reference: str, odd: bool) -> str:
-    return f"{f'sign({variable}) * ' if odd else ''}(abs({variable}) / {reference})**p"
-
-
-def _bumper_power(side: str, place: LawPlace, words: str) -> TermFamily:
-    return TermFamily(
-        f"{side}bumper_power", CONTACT, place, f"k * {_power('d', 'd0', True)}",
-        {"p": (0.5, 1.5, 2.0, 3.0, 5.0)}, ("d", True), title=f"{words} law",
-    )  # fmt: skip
-
-
-def _drifts(
-    place: LawPlace, name: str, shape: str, ladder: Mapping[str, Sequence[float]], words: str
-) -> tuple[TermFamily, TermFamily]:
-    """Return the families of a force that drifts, and of one that settles."""
-    return (
-        TermFamily(
-            f"drifting_{name}", DRIFT, place, f"k * t / t0 * {shape}", ladder,
-            title=f"{words} that drifts",
-        ),
-        TermFamily(
-            f"settling_{name}", DRIFT, place, f"k * exp(-t / tau) * {shape}",
-            {**ladder, "tau": TIMES}, title=f"{words} that settles",
-        ),
-    )  # fmt: skip
-
-
-FAMILIES: tuple[TermFamily, ...] = (
-    TermFamily("spring_power", MEMORYLESS, "damper", f"k * {_power('u', 'u0', True)}",
-               {"p": ODD_EXPONENTS}, ("u", True), title="nonlinear spring"),
-    TermFamily("constant_force", MEMORYLESS, "damper", "k", {},
-               title="constant force, or offset of its sensor"),
-    TermFamily("even_spring", MEMORYLESS, "damper", f"k * {_power('u', 'u0', False)}",
-               {"p": EVEN_EXPONENTS}, ("u", False), title="spring that differs by direction"),
-    TermFamily("saturating_spring", MEMORYLESS, "damper", "k * tanh(u / w)",
-               {"w": LENGTHS}, title="saturating spring"),
-    TermFamily("exponential_spring", MEMORYLESS, "damper", "k * sinh(u / w)",
-               {"w": (0.15, 0.25, 0.5)}, title="exponentially hardening spring"),
-    TermFamily("stop_spring", MEMORYLESS, "damper", "k * sign(u) * max(abs(u) - w, 0) / u0",
-               {"w": STOPS}, title="spring with a knee"),
-    TermFamily("right_stop_spring", MEMORYLESS, "damper", "k * max(u - w, 0) / u0",
-               {"w": STOPS}, title="spring that acts beyond a clearance on the right"),
-    TermFamily("left_stop_spring", MEMORYLESS, "damper", "k * min(u + w, 0) / u0",
-               {"w": STOPS}, title="spring that acts beyond a clearance on the left"),
-    TermFamily("damping_power", MEMORYLESS, "damper", f"k * {_power('v', 'v0', True)}",
-               {"p": (0.3, *ODD_EXPONENTS)}, ("v", True), title="nonlinear damping"),
-    TermFamily("even_damping", MEMORYLESS, "damper", f"k * {_power('v', 'v0', False)}",
-               {"p": EVEN_EXPONENTS}, ("v", False), title="damping that differs by direction"),
-    TermFamily("saturating_damping", MEMORYLESS, "damper", "k * tanh(v / s)",
-               {"s": SPEEDS}, title="saturating damping"),
-    TermFamily("fading_friction", MEMORYLESS, "damper",
-               "k * tanh(v / (0.1 * s)) * exp(-(v / s)**2)",
-               {"s": (0.05, 0.15, 0.4)}, title="friction that fades with speed"),
-    TermFamily("one_way_damping", MEMORYLESS, "damper", "k * (max(v, 0) / v0)**p",
-               {"p": (1.0, 2.0, 3.0)}, title="damping in one direction"),
-    TermFamily("position_damping", MEMORYLESS, "damper",
-               f"k * v / v0 * {_power('u', 'u0', False)}",
-               {"p": (1.0, 2.0, 4.0)}, ("u", False), title="damping that depends on position"),
-    TermFamily("even_position_damping", MEMORYLESS, "damper",
-               f"k * v / v0 * {_power('u', 'u0', True)}",
-               {"p": (1.0, 3.0)}, ("u", True), title="damping that depends on position"),
-    TermFamily("position_friction", MEMORYLESS, "damper",
-               f"k * tanh(v / s) * {_power('u', 'u0', False)}",
-               {"p": (1.0, 2.0), "s": (0.006, 0.03)}, title="friction that depends on position"),
-    TermFamily("speed_stiffness", MEMORYLESS, "damper",
-               f"k * u / u0 * {_power('v', 'v0', False)}",
-               {"p": (1.0, 2.0)}, ("v", False), title="stiffness that depends on speed"),
-    _bumper_power("", "bumpers", "bumper"),
-    _bumper_power("right_", "right_bumper", "right bumper"),
-    _bumper_power("left_", "left_bumper", "left bumper"),
-    TermFamily("bumper_exponential", CONTACT, "bumpers", "k * sinh(d / w)",
-               {"w": (0.15, 0.3, 0.6)}, title="exponentially hardening bumper"),
-    TermFamily("bumper_damping_power", CONTACT, "bumpers",
-               f"k * v / v0 * {_power('d', 'd0', False)}",
-               {"p": (0.5, 1.0, 2.0, 3.0)}, ("d", False), title="damping that grows with depth"),
-    TermFamily("bumper_rate_power", CONTACT, "bumpers", f"k * {_power('v', 'v0', True)}",
-               {"p": (0.5, 2.0, 3.0)}, ("v", True), title="nonlinear bumper damping"),
-    TermFamily("compression_damping", CONTACT, "bumpers", "k * (max(v, 0) / v0)**p",
-               {"p": (1.0, 2.0)}, title="bumper damping in compression"),
-    TermFamily("contact_softening", CONTACT, "bumpers", "k * h * d / d0", {"tau": CONTACT_TIMES},
-               states={"h": LawState(unit="", rate=f"({TOUCH} - h) / tau")},
-               title="bumper stiffness that changes with the time since touch"),
-    TermFamily("bumper_relaxation", CONTACT, "bumpers", "f", {"tau": RELAXATIONS},
-               states={"f": LawState(unit="N", rate="k * v / d0 - f / tau")},
-               title="bumper that relaxes"),
-    TermFamily("table_power", TABLE, "input", f"g * {_power('y', 'y0', True)}",
-               {"p": (1.0, 2.0, 3.0)}, ("y", True), title="force of the table's position",
-               amplitude=("g", "m/s2")),
-    TermFamily("even_table_power", TABLE, "input", f"g * {_power('y', 'y0', False)}",
-               {"p": (1.0, 2.0)}, ("y", False), title="force of the table's position",
-               amplitude=("g", "m/s2")),
-    TermFamily("table_speed", TABLE, "damper", "k * w / v0", {"tau": (0.03, 0.3)},
-               states={"w": LawState(unit="m/s", rate="a - w / tau")},
-               title="force of the table's velocity"),
-    TermFamily("resonator", RESONATOR, "damper", "mass * (-omega2 * s - decay * (y - v))",
-               {"omega2": RESONANCES, "decay": RESONANCE_DECAYS},
-               states={"s": LawState(unit="m", rate="y - v"),
-                       "y": LawState(unit="m/s", rate="-a - omega2 * s - decay * (y - v)")},
-               title="resonator on the specimen", amplitude=("mass", "kg")),
-    TermFamily("cubic_resonator", RESONATOR, "damper", "mass * (-cubic * s**3 - decay * (y - v))",
-               {"cubic": CUBIC_RESONANCES, "decay": RESONANCE_DECAYS},
-               states={"s": LawState(unit="m", rate="y - v"),
-                       "y": LawState(unit="m/s", rate="-a - cubic * s**3 - decay * (y - v)")},
-               title="resonator with a cubic spring", amplitude=("mass", "kg")),
-    TermFamily("table_resonator", RESONATOR, "damper", "k * (u - r)",
-               {"omega2": RESONANCES, "decay": RESONANCE_DECAYS, "mass": (0.1,)},
-               states={"r": LawState(unit="m", rate="y"),
-                       "y": LawState(unit="m/s",
-                                     rate="-a - omega2 * r - decay * y + k * u / mass")},
-               title="resonator on the table, coupled by a spring", amplitude=("k", "N/m")),
-    TermFamily("hysteresis", MEMORY, "damper", "k * z",
-               {"n": (1.0, 2.0, 4.0), "w": YIELD_LENGTHS},
-               states=HYSTERESIS, title="hysteresis"),
-    TermFamily("slack_hysteresis", MEMORY, "damper", "k * sign(z) * abs(z)**p",
-               {"p": (2.0, 4.0), "n": (1.0, 4.0), "w": YIELD_LENGTHS},
-               states=HYSTERESIS, title="hysteresis behind slack"),
-    TermFamily("relaxation", MEMORY, "damper", "f", {"tau": RELAXATIONS},
-               states={"f": LawState(unit="N", rate="k * v / u0 - f / tau")}, title="relaxation"),
-    TermFamily("nonlinear_relaxation", MEMORY, "damper", "k * (e / u0)**3",
-               {"b": (0.03, 0.1, 0.3, 1.0)},
-               states={"e": LawState(unit="m", rate="v - b * (e / u0)**3")},
-               title="relaxation with a cubic spring"),
-    *_drifts("damper", "spring", "u / u0", {}, "stiffness"),
-    *_drifts("damper", "damping", "v / v0", {}, "damping"),
-    *_drifts("damper", "friction", "tanh(v / s)", {"s": (0.006, 0.03)}, "friction"),
-    *_drifts("bumpers", "bumper", "d / d0", {}, "bumper stiffness"),
-)  # fmt: skip
 
 
 def find_law_class(candidate: Candidate) -> str:
@@ -223,7 +48,7 @@ def find_law_class(candidate: Candidate) -> str:
     return EXPRESSION if family is None else family.law_class
 
 
-def find_family(candidate: Candidate) -> TermFamily | None:
+def find_family(candidate: Candidate) -> ForceTerm | None:
     """Return the family of a term; None for an effect of the library or a free expression."""
     return next(
         (family for family in FAMILIES if candidate.name == f"{LAW_PREFIX}{family.name}"), None
@@ -239,7 +64,7 @@ def list_law_candidates(scale: RecordScale, has_contact: bool) -> tuple[Candidat
     )
 
 
-def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
+def make_law_candidate(family: ForceTerm, scale: RecordScale) -> Candidate:
     """Return a term family as a candidate, its references at the largest values of the record."""
     in_bumper = family.place not in ("damper", "input")
     length = scale.depth if in_bumper else scale.u
@@ -256,28 +81,30 @@ def make_law_candidate(family: TermFamily, scale: RecordScale) -> Candidate:
         name: [value * sizes[SHAPE_UNITS[name]] for value in ladder]
         for name, ladder in family.shapes.items()
     }
-    parameters = {
-        amplitude: LawParameter(
-            unit=unit, low=0.0 if unit in POSITIVE_UNITS else -100 * size, high=100 * size,
-            vanishing=0.0, typical=0.1 * size, meaning="Amplitude.",
-        )
-    }  # fmt: skip
+    low = 0.0 if unit in POSITIVE_UNITS else -100 * size
+    parameters = [EffectParameter(amplitude, unit, low, 100 * size, 0.0, 0.1 * size, "Amplitude.")]
     for name, ladder in ladders.items():
         low, high = ladder[0] / SHAPE_MARGIN, ladder[-1] * SHAPE_MARGIN
         if name in ("p", "n"):
             low, high = (1.0 if name == "n" else MIN_EXPONENT), MAX_EXPONENT
         elif name == "s":
             low = max(low, MIN_SLIP_SHARE * scale.v)
-        parameters[name] = LawParameter(
-            unit=SHAPE_UNITS[name], low=low, high=high, typical=ladder[len(ladder) // 2],
-            meaning="Exponent." if name in ("p", "n") else "Shape.",
-        )  # fmt: skip
-    parameters |= describe_references(used)
-    law = EffectFile(
-        id=f"{LAW_PREFIX}{family.name}", title=family.title, place=family.place, force=family.force,
-        parameters=parameters, states=dict(family.states),
-        range=list_valid_range(family.place, scale),
-    )  # fmt: skip
+        meaning = "Exponent." if name in ("p", "n") else "Shape."
+        middle = ladder[len(ladder) // 2]
+        parameters.append(
+            EffectParameter(name, SHAPE_UNITS[name], low, high, None, middle, meaning)
+        )
+    law = Effect(
+        id=f"{LAW_PREFIX}{family.name}",
+        title=family.title,
+        term=family.force,
+        place=family.place,
+        force=family.force,
+        parameters=(*parameters, *describe_references(used)),
+        states=family.states,
+        valid_range=list_valid_range(family.place, scale),
+        is_of_file=True,
+    )
     return make_candidate(law, used, ladders, scale)
 
 
@@ -288,34 +115,36 @@ def list_references(scale: RecordScale, texts: Sequence[str]) -> dict[str, float
     return {name: own for name, own in references.items() if any(name in text for text in texts)}
 
 
-def describe_references(references: Mapping[str, float]) -> dict[str, LawParameter]:
-    """Return the parameters of a law for largest values of the record, SI, by name."""
-    return {
-        name: LawParameter(
-            unit=REFERENCE_UNITS[name], low=0.5 * value, high=2 * value, typical=value,
-            meaning="Reference: largest value in the recordings.",
-        )
+def describe_references(references: Mapping[str, float]) -> list[EffectParameter]:
+    """Return the parameters of a law for largest values of the record, SI."""
+    meaning = "Reference: largest value in the recordings."
+    return [
+        EffectParameter(name, REFERENCE_UNITS[name], 0.5 * value, 2 * value, None, value, meaning)
         for name, value in references.items()
-    }  # fmt: skip
+    ]
 
 
-def list_valid_range(place: LawPlace, scale: RecordScale) -> dict[str, tuple[float, float]]:
+def list_valid_range(place: str, scale: RecordScale) -> tuple[tuple[str, float, float], ...]:
     """Return the range of each variable of a law at a place, SI, by the largest of the record."""
     ends = {"u": scale.u, "v": scale.v, "d": scale.depth, "a": scale.acc, "y": scale.table_disp}
-    valid_range = {name: (-end, end) for name, end in ends.items()} | {"t": (0.0, scale.duration_s)}
-    return {name: valid_range[name] for name in list_variables(place)}
+    valid_range = {name: (name, -end, end) for name, end in ends.items()}
+    valid_range["t"] = ("t", 0.0, scale.duration_s)
+    return tuple(valid_range[name] for name in list_variables(place))
 
 
 def make_candidate(
-    law: EffectFile,
+    effect: Effect,
     constants: Mapping[str, float],
     ladders: Mapping[str, Sequence[float]],
     scale: RecordScale,
 ) -> Candidate:
-    """Return a law as a candidate, with values that stay fixed and trial values of its shapes."""
-    effect = law.build_effect()
+    """Return a law as a candidate, with values that stay fixed and trial values of its shapes.
+
+    InputError if it is no law.
+    """
+    check_new_effect(effect)
     free = [
-        _set_bounds(own, law.parameters[own.key.name])
+        _set_bounds(own, effect.parameter(own.key.name))
         for own in list_effect_parameters(effect, scale)
         if isinstance(own.key, EffectKey) and own.key.name not in constants
     ]
@@ -330,7 +159,7 @@ def make_candidate(
     return Candidate(effect.id, tuple(free), amplitude, 0.0, shapes, effect, constants=fixed)
 
 
-def _set_bounds(free: FreeParameter, parameter: LawParameter) -> FreeParameter:
+def _set_bounds(free: FreeParameter, parameter: EffectParameter) -> FreeParameter:
     """Return a free parameter with the bounds of the law, which come from the record already."""
     scale = parameter.high / 100 if parameter.vanishing is not None else parameter.typical
     return FreeParameter(
@@ -349,31 +178,32 @@ def round_exponent(
     family, key = find_family(term), EffectKey(term.name, "p")
     if family is None or family.power is None or key not in parameters.values:
         return None
-    assert isinstance(term.effect, WrittenEffect)
-    law, (variable, is_odd) = term.effect.law, family.power
+    law, (variable, is_odd) = term.effect, family.power
+    assert law is not None
     reference = f"{variable}0"
     exponent = min(ROUND_EXPONENTS, key=lambda value: abs(value - parameters.values[key]))
     reference_value = parameters.values[EffectKey(term.name, reference)]
     amplitude = parameters.values[term.amplitude.key]
-    kept = {name: own for name, own in law.parameters.items() if name != "p"}
+    kept = {own.name: own for own in law.parameters if own.name != "p"}
+    power = write_power(variable, reference, is_odd)
     if exponent.is_integer():
         text = _write_power(variable, int(exponent), is_odd)
         amplitude /= reference_value**exponent
         ratio = reference_value**-exponent
-        if reference not in law.force.replace(_power(variable, reference, is_odd), ""):
+        if reference not in law.force.replace(power, ""):
             del kept[reference]
-        main = law.parameters[term.amplitude.key.name]  # type: ignore[union-attr]
-        unit = _divide_unit(main.unit, REFERENCE_UNITS[reference], int(exponent))
-        kept[term.amplitude.key.name] = main.model_copy(  # type: ignore[union-attr]
-            update={
-                "unit": unit, "low": main.low * ratio, "high": main.high * ratio,
-                "typical": main.typical * ratio,
-            }
-        )  # fmt: skip
+        main = law.parameter(family.amplitude[0])
+        kept[main.name] = replace(
+            main,
+            unit=_divide_unit(main.unit, REFERENCE_UNITS[reference], int(exponent)),
+            low=main.low * ratio,
+            high=main.high * ratio,
+            typical=main.typical * ratio,
+        )
     else:
-        text = _power(variable, reference, is_odd).replace("**p", f"**{exponent:g}")
-    force = law.force.replace(_power(variable, reference, is_odd), text)
-    rounded = law.model_copy(update={"force": force, "parameters": kept})
+        text = power.replace("**p", f"**{exponent:g}")
+    force = law.force.replace(power, text)
+    rounded = replace(law, term=force, force=force, parameters=tuple(kept.values()))
     values = {name: parameters.values[EffectKey(term.name, name)] for name in kept}
     constants = {name: values[name] for name in kept if name in REFERENCE_UNITS}
     ladders = {

@@ -13,9 +13,9 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.errors import InputError
 from twin.discovery.motion import MeasuredMotion, RecordScale
-from twin.model.effects import find_effect
-from twin.model.effects.effect import Effect, EffectParameter
-from twin.model.effects.expression import split_unit
+from twin.laws.effect import Effect, EffectParameter
+from twin.laws.expression import split_unit
+from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model, SensorModel
 from twin.model.parameters import Parameters
 
@@ -320,9 +320,9 @@ def measure_size(
     """
     if effect.acts == "sensor":
         return scale.readings.get(channel) if parameter.name == "offset" else None
-    if effect.input_acceleration is not None:
-        values = {other.name: other.typical for other in effect.parameters}
-        largest = abs(float(effect.input_acceleration(scale.table_disp, values)))
+    if effect.place == "input":
+        force = effect.evaluate_force(effect.typical_values, {"y": scale.table_disp})
+        largest = abs(float(force))
         return abs(parameter.typical) * scale.acc / largest if largest else None
     if parameter.unit == "m" and parameter.vanishing is not None:
         return SMALL_LENGTH_SHARE * scale.u

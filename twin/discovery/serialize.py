@@ -27,7 +27,8 @@ from twin.discovery.parameters import (
 from twin.discovery.selection import FittedSet
 from twin.discovery.sensor_checks import SensorCheck, check_sensors
 from twin.discovery.verdict import closed_fraction, suggest_next_run
-from twin.model.effects.effect_file import EffectFile, WrittenEffect
+from twin.laws.effect import Effect
+from twin.laws.effect_file import format_effect_file
 from twin.model.model import SENSOR_CHANNELS, Model
 from twin.model.parameters import Parameters
 
@@ -396,7 +397,7 @@ def model_to_toml(
     files = {
         effect.id: effect_file_name(effect)
         for effect in fit.parameters.effects.values()
-        if isinstance(effect, WrittenEffect)
+        if effect.is_of_file
     }
     base = fit.parameters.to_model().base
     return format_model_toml(texts, base, kept, intervals, files), omitted
@@ -442,18 +443,18 @@ def format_model_toml(
     return "\n".join(lines) + "\n"
 
 
-def effect_file_name(effect: WrittenEffect) -> str:
+def effect_file_name(effect: Effect) -> str:
     """Return the name of the effect file that a model file refers to."""
     return f"{effect.id}.toml"
 
 
-def list_effect_files(fit: FitResult, laws: Sequence[EffectFile] = ()) -> dict[str, str]:
+def list_effect_files(fit: FitResult, laws: Sequence[Effect] = ()) -> dict[str, str]:
     """Return the texts by name of the effect files of a fitted model; `laws` describe new ones."""
-    texts = {law.id: law.format_text() for law in laws}
+    described = {law.id: law for law in laws}
     return {
-        effect_file_name(effect): texts.get(effect.id, effect.source)
+        effect_file_name(effect): format_effect_file(described.get(effect.id, effect))
         for effect in fit.parameters.effects.values()
-        if isinstance(effect, WrittenEffect)
+        if effect.is_of_file
         and any(
             isinstance(key, EffectKey) and key.effect == effect.id for key in fit.parameters.values
         )
@@ -474,11 +475,11 @@ def law_to_json(proposal: LawProposal, factor: float) -> Json:
                 "states": {name: state.rate for name, state in law.states.items()},
                 "parameters": effect_to_json(term, fitted.fit, 1.0)["parameters"]
                 | {
-                    key.name: interval_to_json(value, 0.0, law.parameters[key.name].unit)
+                    key.name: interval_to_json(value, 0.0, law.parameter(key.name).unit)
                     for key, value in term.constants.items()
                     if isinstance(key, EffectKey)
                 },
-                "range": {name: [*limits] for name, limits in law.range.items()},
+                "range": {name: [low, high] for name, low, high in law.valid_range},
             }
             for law, term in zip(proposal.laws, terms, strict=True)
         ],

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D, Float2D
+from table_io.errors import InputError
 from twin.discovery.candidates import Candidate
 from twin.discovery.law_terms import (
     LAW_PREFIX,
@@ -27,8 +28,9 @@ from twin.discovery.law_terms import (
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.model.effects.effect_file import EffectFile, LawParameter, LawPlace
-from twin.model.effects.expression import parse_expression
+from twin.laws.effect import Effect, EffectParameter, Place
+from twin.laws.expression import parse_expression
+from twin.laws.library import check_new_effect
 
 SYMBOLIC_PREFIX = f"{LAW_PREFIX}expression_"
 MISSING_MESSAGE = (
@@ -65,7 +67,7 @@ def list_symbolic_candidates(
 
 def _list_problems(
     log_residuals: Sequence[LogResiduals], parameters: ParameterSet, scale: RecordScale
-) -> Iterator[tuple[LawPlace, Mapping[tuple[str, str], Float1D], Float1D]]:
+) -> Iterator[tuple[Place, Mapping[tuple[str, str], Float1D], Float1D]]:
     """Yield (place, dimensionless motion by variable and reference, force left in N)."""
     damper, bumpers = [], []
     for residuals in log_residuals:
@@ -154,7 +156,7 @@ class _ConstantParameters(ast.NodeTransformer):
 
 
 def make_term(
-    place: LawPlace, tree: ast.expr, features: Sequence[str], motion: Sequence[Float1D],
+    place: Place, tree: ast.expr, features: Sequence[str], motion: Sequence[Float1D],
     scale: RecordScale, number: int,
 ) -> Candidate | None:  # fmt: skip
     """Return an expression as a candidate; None if it is no law, as one that pulls at touch."""
@@ -162,29 +164,31 @@ def make_term(
     shape = ast.unparse(ast.fix_missing_locations(transformer.visit(tree)))
     values = {f"c{k}": value for k, value in enumerate(transformer.values, 1) if value > 0.0}
     references = list_references(scale, [shape])
-    parameters = {
-        "k": LawParameter(
-            unit="N", low=-100 * scale.force, high=100 * scale.force, vanishing=0.0,
-            typical=0.1 * scale.force, meaning="Amplitude.",
-        )
-    }  # fmt: skip
-    for name, value in values.items():
-        parameters[name] = LawParameter(
-            unit="",
-            low=value / SHAPE_MARGIN,
-            high=value * SHAPE_MARGIN,
-            typical=value,
-            meaning="Coefficient.",
-        )
-    parameters |= describe_references(references)
+    size = scale.force
+    parameters = [
+        EffectParameter("k", "N", -100 * size, 100 * size, 0.0, 0.1 * size, "Amplitude."),
+        *(
+            EffectParameter(
+                name, "", value / SHAPE_MARGIN, value * SHAPE_MARGIN, None, value, "Coefficient."
+            )
+            for name, value in values.items()
+        ),
+        *describe_references(references),
+    ]
+    force = f"k * ({shape})"
+    law = Effect(
+        id=f"{SYMBOLIC_PREFIX}{number + 1}",
+        title="expression of symbolic regression",
+        term=force,
+        place=place,
+        force=force,
+        parameters=tuple(parameters),
+        valid_range=list_valid_range(place, scale),
+        is_of_file=True,
+    )
     try:
-        law = EffectFile(
-            id=f"{SYMBOLIC_PREFIX}{number + 1}", title="expression of symbolic regression",
-            place=place, force=f"k * ({shape})", parameters=parameters,
-            range=list_valid_range(place, scale),
-        )  # fmt: skip
-        law.build_effect()
-    except ValueError:  # InputError, also within the validation of the file
+        check_new_effect(law)
+    except InputError:
         return None
     free = _select_independent(shape, values, features, motion, references)
     fixed = {name: value for name, value in values.items() if name not in free}

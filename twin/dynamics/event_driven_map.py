@@ -29,8 +29,8 @@ from twin.dynamics.period_map import (
     change_parameter,
     find_parameter,
 )
-from twin.model.effects.effect import Effect
-from twin.model.effects.law import PLACES, LawProperties, evaluate_law, sum_law_properties
+from twin.laws.effect import PLACES, Effect
+from twin.laws.properties import LawProperties, evaluate_law, sum_law_properties
 from twin.model.event_integrator import EventDrivenSolver, kernel_coefficients, set_substeps
 from twin.model.event_integrator_kernel import (
     CONTACT_L,

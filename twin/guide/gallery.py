@@ -1,10 +1,7 @@
 """Gallery of the effects: law, loop without and with it, residual, what it is confused with."""
 
 import re
-from importlib import import_module
-from inspect import getdoc
 from textwrap import dedent
-from types import ModuleType
 
 import typer
 
@@ -18,10 +15,9 @@ from twin.guide.loops import (
     shows_in_contact,
 )
 from twin.guide.reference import format_table
-from twin.model import effects
-from twin.model.effects import EFFECTS, load_plugins
-from twin.model.effects.effect import Effect
-from twin.model.effects.typesetting import typeset_law
+from twin.laws.effect import Effect
+from twin.laws.library import EFFECTS, load_plugins
+from twin.laws.typesetting import typeset_law
 
 ACTIONS = {
     "parameters": "changes parameters; closed form",
@@ -63,7 +59,8 @@ def write_gallery(_: typer.Typer) -> str:
 
 def _describe_effect(effect: Effect) -> str:
     """Return the section of an effect."""
-    title, _, text = _read_description(effect).partition("\n")
+    description = effect.description or effect.title or f"{effect.term}."
+    title, _, text = description.partition("\n")
     condition = "total gap 4 mm" if shows_in_contact(effect) else "free flight"
     units = {parameter.name: parameter.unit for parameter in effect.parameters}
     values = ", ".join(
@@ -113,14 +110,3 @@ def _typeset_equations(text: str) -> str:
         text,
         flags=re.MULTILINE,
     )
-
-
-def _read_description(effect: Effect) -> str:
-    """Return the docstring of the module of an effect; its term for one without."""
-    module = _find_module(effect)
-    return (getdoc(module) if module else None) or f"{effect.term}."
-
-
-def _find_module(effect: Effect) -> ModuleType | None:
-    """Return the module of a built-in effect, which is named like it."""
-    return import_module(f"{effects.__name__}.{effect.id}") if effect in EFFECTS else None

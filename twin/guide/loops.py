@@ -15,8 +15,8 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.units import GRAVITY_M_S2
-from twin.model.effects import EFFECTS
-from twin.model.effects.effect import Effect
+from twin.laws.effect import Effect
+from twin.laws.library import EFFECTS
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 

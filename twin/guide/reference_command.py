@@ -38,11 +38,11 @@ def print_names(kind: ListKind) -> None:
     header: tuple[str, ...]
     rows: Iterator[tuple[str, ...]]
     if kind is ListKind.effects:
-        from twin.model.effects import EFFECTS, describe_effect, load_plugins
+        from twin.laws.library import EFFECTS, load_plugins
 
         header = ("effect", "meaning", "law", "parameters")
         rows = (
-            (effect.id, describe_effect(effect), effect.term,
+            (effect.id, effect.summary, effect.term,
              ", ".join(f"{value.name} [{value.unit or '-'}]" for value in effect.parameters))
             for effect in (*EFFECTS, *load_plugins())
         )  # fmt: skip

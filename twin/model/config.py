@@ -18,9 +18,9 @@ from table_io.config.base import (
 from table_io.config.profile import Specimen
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
-from twin.model.effects import find_effect
-from twin.model.effects.effect import Effect
-from twin.model.effects.effect_file import EffectFile
+from twin.laws.effect import Effect
+from twin.laws.effect_file import EffectFile
+from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 

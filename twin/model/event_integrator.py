@@ -3,22 +3,17 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.linalg import expm
 
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
+from twin.laws.effect import DAMPER
+from twin.laws.properties import LawProperties, is_linear_in_rate, sum_law_properties
 from twin.model import closed_form
 from twin.model.added_laws import compile_laws, pack_constants
-from twin.model.effects import bumper_hardening, cubic_stiffness
-from twin.model.effects.law import (
-    DAMPER,
-    LawProperties,
-    is_linear_in_rate,
-    sum_law_properties,
-)
 from twin.model.event_integrator_kernel import (
     CLOCK,
     DIRECTION,
@@ -36,6 +31,8 @@ from twin.model.force_laws import (
     Coefficients,
     LawInputs,
     add_law_force,
+    cubic_force,
+    hardening_force,
 )
 from twin.model.parameters import Parameters
 from twin.model.solver import StateEstimate
@@ -125,21 +122,9 @@ class EventDrivenSolver:
 
 def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]:
     """Return (coefficients that do not depend on the rate, compiled laws that effects bring)."""
-
-    def value(effect: str, parameter: str) -> float:
-        return model.effect_parameter(effect, parameter) or 0.0
-
-    def rate(effect: str) -> float:
-        tau = model.effect_parameter(effect, "tau")
-        return 1 / tau if tau else 0.0
-
-    k3, k2 = value("cubic_stiffness", "k3"), value("bumper_hardening", "k2")
-    c2, ch = value("quadratic_damping", "c2"), value("hunt_crossley", "ch")
-    fc, fy, pull = model.break_away_force_n, value("bouc_wen", "force"), value("adhesion", "force")
-    added = model.added_laws
-    has_reversals = bool(c2 or fc or fy or added)
-    p = model.parameters
-    coefficients = Coefficients(
+    p, added = model.parameters, model.added_laws
+    of_effects: dict[str, Any] = dict(model.coefficients)
+    own = Coefficients(
         m=p.mass,
         k=p.stiffness,
         c=p.damping,
@@ -147,22 +132,12 @@ def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]
         k_l=p.bumper_stiffness_l,
         c_r=p.bumper_damping_r,
         c_l=p.bumper_damping_l,
-        k3=k3,
-        c2=c2,
-        fc=fc,
-        fy=fy,
-        uy=value("bouc_wen", "yield_displacement") or 1.0,
-        k1=value("maxwell_damper", "k1"),
-        rate_1=rate("maxwell_damper"),
-        k2=k2,
-        ch=ch,
-        kb=value("bumper_maxwell", "kb"),
-        rate_b=rate("bumper_maxwell"),
-        pull=pull,
-        drift=value("gap_drift", "rate"),
         gap_r=min(p.gap_r, NO_WALL_M),
         gap_l=min(p.gap_l, NO_WALL_M),
-        is_linear=not (has_reversals or k3 or k2 or ch or pull),
+    )._replace(**of_effects)
+    has_reversals = bool(own.c2 or own.fc or own.fy or added)
+    coefficients = own._replace(
+        is_linear=not (has_reversals or own.k3 or own.k2 or own.ch or own.pull),
         has_reversals=has_reversals,
         has_bumper_states=any(effect.is_in_bumpers and effect.states for effect, _ in added),
         has_rate_laws=any(
@@ -171,7 +146,7 @@ def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]
         ),
         laws=pack_constants(added),
     )
-    return coefficients, compile_laws(tuple(effect for effect, _ in added))
+    return coefficients, compile_laws([effect for effect, _ in added])
 
 
 def set_substeps(
@@ -274,13 +249,13 @@ def equilibrium_disp(
         if d <= 0:
             return 0.0
         return add_law_force(
-            k * d + bumper_hardening.force(d, k2), side, d, 0.0, relaxed, coefficients, laws
+            k * d + hardening_force(d, k2), side, d, 0.0, relaxed, coefficients, laws
         )
 
     def force(u: float) -> float:
         right = push(0, u - p.gap_r, p.bumper_stiffness_r)
         left = push(1, -u - p.gap_l, p.bumper_stiffness_l)
-        damper = p.stiffness * u + cubic_stiffness.force(u, k3)
+        damper = p.stiffness * u + cubic_force(u, k3)
         damper = add_law_force(damper, DAMPER, u, 0.0, relaxed, coefficients, laws)
         return damper + right - left
 

@@ -3,7 +3,7 @@
 The state is float64 (STATE_SIZE,):
     u, v, u_r, u_l, contact_r, contact_l, A      as in `closed_form`
     f, b_r, b_l                                  branch forces in N, of u's sign
-    z, s                                         hysteresis; states of added laws, `LAW_STATES`
+    z, s                                         hysteresis; states of added laws, `MAX_STATES`
     direction                                    sign of u', 0 where the mass sticks
     clock                                        samples since sample 0 of the run
 There is no other memory: results are bit-identical for any division of the samples into blocks.
@@ -22,9 +22,9 @@ from table_io.compilation import (
     jit_helper_unless_none,
     jit_kernel,
 )
+from twin.laws.properties import MAX_STATES
 from twin.model.event_location import REVERSAL_GUARD, StateAndRates, integrate_to_event
 from twin.model.force_laws import (
-    LAW_STATES,
     LAWS_TYPES,
     PLAIN_TYPES,
     AddedLaws,
@@ -44,7 +44,7 @@ from twin.model.solver import OUTPUT_COUNT
 
 U, V, U_R, U_L, CONTACT_R, CONTACT_L, STATE_BASE, STATE_F, STATE_B_R, STATE_B_L, STATE_Z = range(11)
 STATE_S = STATE_Z + 1
-DIRECTION, CLOCK, STATE_SIZE = (STATE_S + LAW_STATES + n for n in range(3))
+DIRECTION, CLOCK, STATE_SIZE = (STATE_S + MAX_STATES + n for n in range(3))
 DENORMAL_LIMIT = 1e-30  # m, N, 1: smaller values are set to zero
 MAX_EVENTS_PER_STEP = 60  # only rounding can come near it
 
@@ -133,7 +133,7 @@ def read_states(state: Float1D, laws: Any) -> LawInputs | None:
 @jit_helper_unless_none("s", lambda state, s: None)
 def write_states(state: Float1D, s: Any) -> None:
     """Write the states of added laws into a state."""
-    for index in range(LAW_STATES):
+    for index in range(MAX_STATES):
         state[STATE_S + index] = s.states[index]
 
 

@@ -6,29 +6,24 @@
     flight:  F_j = 0, that sum is zero and u_j relaxes
     f' = k1 u' - f / tau1,  b_j' = kb u_j' - b_j / tau,  G0j grows with the gap drift
 
-SI, right positive. Each term is described in its file in `effects`; D and B_j are the forces of
-effects that bring their own law (see `added_laws`), with their internal states `s`. An effect with
-a zero coefficient is absent. Sides are 0 = right, 1 = left.
+SI, right positive. Each term is a row of `twin.laws.library`, whose `compiled` names its
+coefficients here; D and B_j are the forces of all other rows and plug-ins (see `added_laws`), with
+their internal states `s`. An effect with a zero coefficient is absent. Sides: 0 right, 1 left.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, get_type_hints
 
 from numba import float64, int64, types
 
 from table_io.compilation import jit_helper, jit_helper_unless_none
-from twin.model.effects import (
-    bouc_wen,
-    bumper_hardening,
-    coulomb_friction,
-    cubic_stiffness,
-    hunt_crossley,
-    quadratic_damping,
-)
-from twin.model.effects.law import DAMPER
+from twin.laws.effect import DAMPER
+from twin.laws.expression import build_function
+from twin.laws.library import find_effect
+from twin.laws.properties import MAX_CONSTANTS, MAX_STATES, write_force
 
-LAW_CONSTANTS, LAW_STATES = 16, 6  # of all added laws of a model together
-NO_STATES = (0.0,) * LAW_STATES
+NO_STATES = (0.0,) * MAX_STATES
 REVERSAL_SPEED_M_S = 1e-300  # of the sign that follows a reversal
 NO_WALL_M = 1e9  # m: gap of an absent bumper; finite, so that zero times it is zero
 MAX_ROOT_STEPS = 60  # of the rate of a free face, where a law is not linear in it
@@ -39,14 +34,14 @@ RATE_TOLERANCE = 1e-13  # relative, of that rate
 AddedLaws = Callable[
     [int, float, float, float, float, tuple[float, ...], tuple[float, ...]], tuple[float, ...]
 ]
-ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + LAW_STATES)(
+ADDED_LAWS_SIGNATURE = types.UniTuple(float64, 1 + MAX_STATES)(
     int64,
     float64,
     float64,
     float64,
     float64,
-    types.UniTuple(float64, LAW_STATES),
-    types.UniTuple(float64, LAW_CONSTANTS),
+    types.UniTuple(float64, MAX_STATES),
+    types.UniTuple(float64, MAX_CONSTANTS),
 )
 
 
@@ -94,10 +89,11 @@ class Start(NamedTuple):
 class Coefficients(NamedTuple):
     """Coefficients of a model at one sampling rate; the step-dependent ones are zero before that.
 
-    `rate_1` and `rate_b` are 1/tau; gaps are those at sample 0; `step` is one of `substeps` of the
-    sampling period. `has_reversals`: reversals of u' are events. `laws` are the constants of the
-    added laws, `has_bumper_states` is true if one in a bumper has states, `has_rate_laws` if one
-    there is not linear in the rate.
+    From `k3` to `drift` those of effects, absent by default: `rate_1` and `rate_b` are 1/tau, `fc`
+    is the force up to which dry friction sticks. Gaps are those at sample 0; `step` is one of
+    `substeps` of the sampling period. `has_reversals`: reversals of u' are events. `laws` are the
+    constants of the added laws, `has_bumper_states` is true if one in a bumper has states,
+    `has_rate_laws` if one there is not linear in the rate.
     """
 
     m: float
@@ -107,26 +103,26 @@ class Coefficients(NamedTuple):
     k_l: float
     c_r: float
     c_l: float
-    k3: float
-    c2: float
-    fc: float
-    fy: float
-    uy: float
-    k1: float
-    rate_1: float
-    k2: float
-    ch: float
-    kb: float
-    rate_b: float
-    pull: float
-    drift: float
     gap_r: float
     gap_l: float
-    is_linear: bool
-    has_reversals: bool
-    has_bumper_states: bool
-    has_rate_laws: bool
-    laws: tuple[float, ...] | None
+    k3: float = 0.0
+    c2: float = 0.0
+    fc: float = 0.0
+    fy: float = 0.0
+    uy: float = 1.0
+    k1: float = 0.0
+    rate_1: float = 0.0
+    k2: float = 0.0
+    ch: float = 0.0
+    kb: float = 0.0
+    rate_b: float = 0.0
+    pull: float = 0.0
+    drift: float = 0.0
+    is_linear: bool = True
+    has_reversals: bool = False
+    has_bumper_states: bool = False
+    has_rate_laws: bool = False
+    laws: tuple[float, ...] | None = None
     period: float = 0.0
     substeps: int = 0
     step: float = 0.0
@@ -142,16 +138,50 @@ def _coefficients_type(constants_type: types.Type) -> types.NamedTuple:
 # Types of (coefficients, laws) for which kernels are compiled: without added laws, and with them.
 PLAIN_TYPES = (_coefficients_type(types.none), types.none)
 LAWS_TYPES = (
-    _coefficients_type(types.UniTuple(float64, LAW_CONSTANTS)),
+    _coefficients_type(types.UniTuple(float64, MAX_CONSTANTS)),
     types.FunctionType(ADDED_LAWS_SIGNATURE),
 )
 
-cubic_force = jit_helper(inlined=True)(cubic_stiffness.force)
-quadratic_force = jit_helper(inlined=True)(quadratic_damping.force)
-coulomb_force = jit_helper(inlined=True)(coulomb_friction.force)
-hysteretic_variable = jit_helper()(bouc_wen.hysteretic_variable)
-hardening_force = jit_helper(inlined=True)(bumper_hardening.force)
-hunt_crossley_damping = jit_helper(inlined=True)(hunt_crossley.damping)
+
+def _compile_force(
+    effect: str, arguments: Sequence[str], names: Mapping[str, str] | None = None
+) -> Callable[..., float]:
+    """Return the force of a row of the library as a helper of kernels, some names replaced."""
+    text = write_force(find_effect(effect), arguments, names or {})
+    return jit_helper(inlined=True)(build_function(text))
+
+
+cubic_force = _compile_force("cubic_stiffness", ("u", "k3"))
+hardening_force = _compile_force("bumper_hardening", ("d", "k2"))
+# `direction` = +1 or -1 is the sign of v until a reversal, which rounding may not be.
+quadratic_force = _compile_force(
+    "quadratic_damping", ("v", "direction", "c2"), {"sign(v)": "direction"}
+)
+hunt_crossley_damping = _compile_force("hunt_crossley", ("d", "ch"), {"v": "1.0"})
+
+
+@jit_helper(inlined=True)
+def coulomb_force(direction: float, fc: float) -> float:
+    """Return the dry friction in N during slip; `direction` is the sign of u', 0 if stuck."""
+    return fc * direction
+
+
+@jit_helper()
+def hysteretic_variable(z: float, du: float, direction: float, uy: float) -> float:
+    """Return z of `bouc_wen` after du m more in `direction` = +1 or -1, starting from z.
+
+    In closed form, as z depends on the path, not on the speed:
+        unloading (u' z < 0)  z = z0 + (u - u0) / uy     up to z = 0
+        loading               z = tanh((u - u0) / uy + artanh z0)
+    """
+    start = direction * z
+    step = direction * du / uy
+    if start < 0.0:
+        if start + step <= 0.0:
+            return direction * (start + step)
+        return direction * math.tanh(start + step)
+    gain = math.tanh(step)
+    return direction * (start + gain) / (1.0 + start * gain)
 
 
 @jit_helper_unless_none("laws", lambda force, place, q, w, s, p, laws: force)

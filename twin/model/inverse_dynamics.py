@@ -22,8 +22,8 @@ from table_io.compilation import (
     jit_helper_unless_none,
     jit_kernel,
 )
-from twin.model.effects.effect_file import WrittenEffect
-from twin.model.effects.law import DAMPER, PLACES, sum_law_properties
+from twin.laws.effect import DAMPER, PLACES, Effect
+from twin.laws.properties import sum_law_properties
 from twin.model.event_integrator import kernel_coefficients
 from twin.model.force_laws import (
     LAWS_TYPES,
@@ -384,31 +384,31 @@ def forces_along(
         inputs = {"v": v, "a": base_acc, "t": time_s}
         for place in PLACES[effect.place]:
             if place == DAMPER:
-                out[0] += effect.expression.evaluate(values | inputs | {"u": u})
+                out[0] += effect.evaluate_force(values, inputs | {"u": u})
                 continue
             sign, gap = (1.0, coefficients.gap_r) if place == 0 else (-1.0, coefficients.gap_l)
             opening = gap + coefficients.drift * time_s
             inputs |= {"d": sign * u - opening, "v": sign * v - coefficients.drift}
-            push = effect.expression.evaluate(values | inputs)
+            push = effect.evaluate_force(values, inputs)
             out[1 + place] += np.where(contact[place] == IN_CONTACT, sign * push, 0.0)
     return out
 
 
 def _split_laws(
     model: Model, is_contact_known: bool
-) -> tuple[Model, list[tuple[WrittenEffect, dict[str, float]]]]:
+) -> tuple[Model, list[tuple[Effect, dict[str, float]]]]:
     """Return (model to compile, laws of effect files that can be evaluated on whole arrays).
 
     A search tries hundreds of laws, and compiling one takes a second. Laws with states, and those
     in bumpers where the model decides on contact, depend on the motion before.
     """
     direct = []
-    faces_have_memory = model.effect_parameter("bumper_maxwell", "kb") or any(
+    faces_have_memory = model.coefficients.get("kb", 0.0) or any(
         effect.is_in_bumpers and effect.states for effect, _ in model.added_laws
     )
     for instance in model.present_effects:
         effect = instance.effect
-        if not isinstance(effect, WrittenEffect) or effect.states or effect.acts != "force":
+        if not effect.is_of_file or effect.states or effect.acts != "force":
             continue
         if effect.place == "damper" or (is_contact_known and not faces_have_memory):
             direct.append((effect, dict(instance.values)))

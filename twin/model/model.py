@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, overload
 
 from table_io.block import Float1D
 from table_io.errors import InputError, suggest
-from twin.model.effects import find_effect
-from twin.model.effects.effect import Effect
-from twin.model.effects.law import changes_with_time, list_constants
+from twin.laws.effect import Effect
+from twin.laws.library import find_effect
 from twin.model.parameters import Parameters
 from twin.model.solver import Solver
 
@@ -85,7 +84,6 @@ class Model:
     effects: tuple[EffectInstance, ...] = ()
 
     def __post_init__(self) -> None:
-        present = {instance.effect.id for instance in self.present_effects}
         p = self.parameters
         has_dashpots = p.bumper_damping_r > 0 and p.bumper_damping_l > 0
         for effect, _ in self.added_laws:
@@ -97,7 +95,7 @@ class Model:
                     allowed="bumper damping above 0 N s/m",
                     remedy="set a bumper damping or remove the effect",
                 )
-        if {"hunt_crossley", "bumper_maxwell"} <= present and not has_dashpots:
+        if {"ch", "kb"} <= self.coefficients.keys() and not has_dashpots:
             raise InputError(
                 "hunt_crossley and bumper_maxwell together need bumper damping: without it the "
                 "speed of the relaxing face at touch is undefined",
@@ -122,7 +120,9 @@ class Model:
         """Base parameters as changed by the effects that act on parameters."""
         result = self.base
         for instance in self.present_effects:
-            result = instance.effect.apply(result, instance.values)
+            if instance.effect.changes:
+                changed = instance.effect.change_base(result.as_dict(), instance.values)
+                result = replace(result, **changed)
         return result
 
     @property
@@ -137,33 +137,35 @@ class Model:
                 )
         return tuple(sensors.values())
 
-    def effect_parameter(self, effect: str, parameter: str) -> float | None:
-        """Return a parameter of a present effect; None if the effect is absent."""
+    @cached_property
+    def coefficients(self) -> dict[str, float]:
+        """What the solver knows of the present effects by coefficients, SI, by name; summed."""
+        total: dict[str, float] = {}
+        base = self.parameters.as_dict()
         for instance in self.present_effects:
-            if instance.effect.id == effect:
-                return instance.values[parameter]
-        return None
+            own = instance.effect.work_out_coefficients(base, instance.values)
+            for name, value in own.items():
+                total[name] = total.get(name, 0.0) + value
+        return total
 
     @cached_property
     def added_laws(self) -> tuple[tuple[Effect, tuple[float, ...]], ...]:
-        """Present effects that bring their own force law, each with the constants of its law."""
+        """Present effects whose force is compiled as written, each with its constants."""
+        base = self.parameters.as_dict()
         return tuple(
-            (instance.effect, list_constants(instance.effect, self.parameters, instance.values))
+            (instance.effect, instance.effect.list_constants(base, instance.values))
             for instance in self.present_effects
-            if instance.effect.force is not None
+            if instance.effect.is_added_law
         )
 
     @property
     def break_away_force_n(self) -> float:
         """Force in N up to which dry friction holds the mass."""
-        stribeck = self.effect_parameter("stribeck_friction", "fc") or 0.0
-        if stribeck:
-            stribeck *= self.effect_parameter("stribeck_friction", "ratio") or 1.0
-        return stribeck + (self.effect_parameter("coulomb_friction", "fc") or 0.0)
+        return self.coefficients.get("fc", 0.0)
 
     @cached_property
     def _input_effects(self) -> tuple[EffectInstance, ...]:
-        return tuple(i for i in self.present_effects if i.effect.input_acceleration is not None)
+        return tuple(i for i in self.present_effects if i.effect.place == "input")
 
     @overload
     def added_acceleration(self, table_disp: float) -> float | None: ...
@@ -176,19 +178,18 @@ class Model:
         """
         added = None
         for instance in self._input_effects:
-            assert instance.effect.input_acceleration is not None
-            own = instance.effect.input_acceleration(table_disp, instance.values)
+            own = instance.effect.evaluate_force(instance.values, {"y": table_disp})
             added = own if added is None else added + own
         return added
 
     def gap_opening_m(self, time_s: float) -> float:
         """Return by how many m each gap has drifted open, `time_s` after sample 0."""
-        return (self.effect_parameter("gap_drift", "rate") or 0.0) * time_s
+        return self.coefficients.get("drift", 0.0) * time_s
 
     def require_steady_state(self) -> None:
         """Raise InputError if an effect changes with time: no motion repeats itself then."""
         for instance in self.present_effects:
-            if changes_with_time(instance.effect):
+            if instance.effect.changes_with_time:
                 raise InputError(
                     "a model that changes with time has no periodic motion",
                     where=f"effect {instance.name!r}",
@@ -274,7 +275,7 @@ class Model:
 
     def _max_angular_frequency(self) -> float:
         """Return the highest angular frequency of any mode in 1/s, without nonlinear terms."""
-        p, kb = self.parameters, self.effect_parameter("bumper_maxwell", "kb") or 0.0
+        p, kb = self.parameters, self.coefficients.get("kb", 0.0)
         sides = [
             stiffness + kb
             for stiffness, gap in (
@@ -285,5 +286,5 @@ class Model:
         ]
         both_contacts = p.gap_r + p.gap_l <= 0
         contact = sum(sides) if both_contacts else max(sides, default=0.0)
-        k = p.stiffness + (self.effect_parameter("maxwell_damper", "k1") or 0.0) + contact
+        k = p.stiffness + self.coefficients.get("k1", 0.0) + contact
         return math.sqrt(k / p.mass)

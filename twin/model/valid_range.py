@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D
-from twin.model.effects.effect import Place
-from twin.model.effects.law import PLACES
+from twin.laws.effect import PLACES, Place
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.recording.reader import Recording
 from twin.results.summary import Json
 

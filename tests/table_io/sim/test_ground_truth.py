@@ -24,7 +24,7 @@ from table_io.sim.ground_truth import (
 )
 from table_io.sim.simulated_table import SensorDistortion, SimulatedBackend
 from tests.builders.truths import seal_truth
-from twin.model.effects import EFFECTS
+from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log
 from twin.results.recordings import read_recorded_config

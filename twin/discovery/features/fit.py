@@ -42,7 +42,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     list_effect_parameters,
 )
-from twin.model.effects import find_effect
+from twin.laws.library import find_effect
 from twin.model.model import Model
 
 # Trial values of a fit. Amplitudes are multiples of the size at which an effect is as large as the

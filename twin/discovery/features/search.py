@@ -19,8 +19,8 @@ from twin.discovery.features.fit import (
     list_trials,
 )
 from twin.discovery.parameters import ParameterSet
-from twin.model.effects import EFFECTS, find_effect, load_plugins
-from twin.model.effects.effect import Effect
+from twin.laws.effect import Effect
+from twin.laws.library import EFFECTS, find_effect, load_plugins
 
 PAIRED_EFFECTS = 4  # of the best, tried in pairs
 REFITTED_WINNERS = 3  # from which the base is refitted once more

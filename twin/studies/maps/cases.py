@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2
-from twin.model.effects import EFFECTS, find_effect
+from twin.laws.library import EFFECTS, find_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import free_flight_resonance
 

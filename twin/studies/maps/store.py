@@ -21,7 +21,7 @@ import numpy.typing as npt
 from table_io.block import Float2D
 from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
-from twin.model.effects import ENTRY_POINT_GROUP as EFFECT_GROUP
+from twin.laws.library import ENTRY_POINT_GROUP as EFFECT_GROUP
 from twin.setup.folders import replace_text
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP

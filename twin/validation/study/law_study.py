@@ -216,7 +216,7 @@ def _describe_terms(law: LawProposal | None) -> list[Json]:
             "id": term.id,
             "force": term.force,
             "rates": {name: state.rate for name, state in term.states.items()},
-            "values": {name: own.typical for name, own in term.parameters.items()},
+            "values": term.typical_values,
         }
         for term in (law.laws if law else ())
     ]
@@ -338,10 +338,12 @@ def _judge_structure(law: LawProposal, about: Json) -> Json:
     (term, *further) = law.laws
     is_exact = not further and term.id == f"{LAW_PREFIX}{expected}"
     if is_exact and exponent is not None:
-        is_exact = abs(_find_exponent(term.force, term.parameters) - exponent) < MAX_EXPONENT_ERROR
+        is_exact = (
+            abs(_find_exponent(term.force, term.typical_values) - exponent) < MAX_EXPONENT_ERROR
+        )
     row: Json = {"exact": is_exact}
     truth = hidden["parameters"]
-    values = {name: own.typical for name, own in term.parameters.items()}
+    values = term.typical_values
     describe_resonator = {
         "appendage": lambda: (
             values
@@ -368,11 +370,11 @@ def _judge_structure(law: LawProposal, about: Json) -> Json:
     return row
 
 
-def _find_exponent(force: str, parameters: Mapping[str, Any]) -> float:
+def _find_exponent(force: str, parameters: Mapping[str, float]) -> float:
     """Return the exponent of a power law: a parameter, or a number in its text."""
     for name in ("p", "n"):
         if name in parameters:
-            return float(parameters[name].typical)
+            return parameters[name]
     written = re.findall(r"\*\*\s*([\d.]+)", force)
     return float(written[0]) if written else 1.0
 

@@ -6,19 +6,20 @@ The wall moves with `rate`, so in contact u_R' = u' - rate and u_L' = u' + rate;
 the moving wall continuously within every step. A side without a bumper is unaffected.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-GAP_DRIFT = Effect(
+EFFECT = Effect(
     id="gap_drift",
+    description=__doc__,
     term="both gaps grow by rate x time",
+    gap_rate="rate",
+    is_linear=True,
     parameters=(
         EffectParameter(
             "rate", "m/s", -1.0, 1.0, 0.0, 5e-6, "Opening speed of the gap of each side."
         ),
     ),
-    acts="linear",
     place="bumpers",
-    is_drift=True,
     residual=(
         "Onset and release move with time on both sides alike, not with frequency: the backward "
         "sweep has other gaps than the forward sweep."

@@ -8,21 +8,17 @@ then the bumper recovers at -K_j u_j / (C_j + ch |u_j|), slower when deep than n
 Source: Hunt and Crossley 1975, J. Appl. Mech. 42(2), exponent 1.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def damping(d: float, ch: float) -> float:
-    """Return ch |d| in N s/m, d the deformation in m."""
-    return ch * abs(d)
-
-
-HUNT_CROSSLEY = Effect(
+EFFECT = Effect(
     id="hunt_crossley",
+    description=__doc__,
     term="ch |u_j| u_j' in each bumper",
+    force="ch * abs(d) * v",
+    compiled={"ch": "ch"},
     parameters=(
         EffectParameter("ch", "N s/m2", 0.0, 1e14, 0.0, 5e5, "Damping per depth of compression."),
     ),
-    acts="force",
     place="bumpers",
     residual=(
         "In contact only: loss that grows with depth; where C_j was fitted without it, a force "

@@ -6,16 +6,20 @@ Linear, so solved exactly. Passive: stored f^2 / (2 k1), loss f^2 / (k1 tau). St
 from low to high frequency, the loss peaks at 1 / (2 pi tau). Source: standard linear solid (Zener).
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter, State
 
-MAXWELL_DAMPER = Effect(
+EFFECT = Effect(
     id="maxwell_damper",
+    description=__doc__,
     term="k1 spring in series with a dashpot, parallel to K and C",
+    force="f",
+    states={"f": State("N", "k1 * v - f / tau")},
+    compiled={"k1": "k1", "rate_1": "1 / tau"},
+    is_linear=True,
     parameters=(
         EffectParameter("k1", "N/m", 0.0, 1e12, 0.0, 8e3, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),
     ),
-    acts="linear",
     residual=(
         "Stiffness and loss that depend on frequency, not on amplitude; no harmonics; present in "
         "flight."

@@ -11,33 +11,21 @@ so no integration is needed. Passive: stored Fy uy z^2 / 2, loss Fy |z|^3 |u'|. 
 small amplitude Fy / uy. Source: Wen 1976, J. Eng. Mech. 102(2).
 """
 
-import math
+from twin.laws.effect import Effect, EffectParameter, State
 
-from twin.model.effects.effect import Effect, EffectParameter
-
-
-def hysteretic_variable(z: float, du: float, direction: float, uy: float) -> float:
-    """Return z after du m more in `direction` = +1 or -1, starting from z."""
-    start = direction * z
-    step = direction * du / uy
-    if start < 0.0:
-        if start + step <= 0.0:
-            return direction * (start + step)
-        return direction * math.tanh(start + step)
-    gain = math.tanh(step)
-    return direction * (start + gain) / (1.0 + start * gain)
-
-
-BOUC_WEN = Effect(
+EFFECT = Effect(
     id="bouc_wen",
+    description=__doc__,
     term="Fy z, rate-independent hysteresis with memory",
+    force="force * z",
+    states={"z": State("", "(v - 0.5 * (abs(v) * z * abs(z) + v * z * z)) / yield_displacement")},
+    compiled={"fy": "force", "uy": "yield_displacement"},
     parameters=(
         EffectParameter("force", "N", 0.0, 1e9, 0.0, 150.0, "Fy, reached far from a reversal."),
         EffectParameter(
             "yield_displacement", "m", 1e-9, 10.0, None, 3e-3, "uy: Fy / uy is the initial slope."
         ),
     ),
-    acts="force",
     limits=("coulomb_friction",),
     residual=(
         "Stiffer and more dissipative at small amplitude; softening and loss together, the same at "

@@ -6,21 +6,17 @@ Odd in u, conservative, stored energy k3 u^4 / 4. With k3 < 0 the spring pulls b
 |u| = sqrt(-K/k3); beyond it the mass escapes. Source: Duffing.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(u: float, k3: float) -> float:
-    """Return k3 u^3 in N, u in m."""
-    return k3 * u * u * u
-
-
-CUBIC_STIFFNESS = Effect(
+EFFECT = Effect(
     id="cubic_stiffness",
+    description=__doc__,
     term="k3 u^3 in the damper",
+    force="k3 * u * u * u",
+    compiled={"k3": "k3"},
     parameters=(
         EffectParameter("k3", "N/m3", -1e15, 1e15, 0.0, 1e7, "Cubic coefficient of the damper."),
     ),
-    acts="force",
     residual=(
         "The resonance moves with the square of the amplitude; a third harmonic in phase with u; "
         "no change of loss; present in flight."

@@ -5,21 +5,17 @@
 Conservative: stored energy k2 |u_j|^3 / 3. In flight the bumper recovers faster.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(d: float, k2: float) -> float:
-    """Return k2 d |d| in N, d the deformation in m, positive in compression."""
-    return k2 * d * abs(d)
-
-
-BUMPER_HARDENING = Effect(
+EFFECT = Effect(
     id="bumper_hardening",
+    description=__doc__,
     term="k2 u_j |u_j| in each bumper",
+    force="k2 * d * abs(d)",
+    compiled={"k2": "k2"},
     parameters=(
         EffectParameter("k2", "N/m2", 0.0, 1e15, 0.0, 1e8, "Coefficient of depth squared."),
     ),
-    acts="force",
     place="bumpers",
     residual=(
         "In contact only: the force grows faster than the depth, so peaks are underestimated and "

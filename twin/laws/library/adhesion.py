@@ -7,17 +7,17 @@ Contact begins as without it. Passive: what the stretched bumper holds at the re
 dashpot. Source: pull-off force, Johnson, Kendall and Roberts 1971, Proc. R. Soc. A 324.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-ADHESION = Effect(
+EFFECT = Effect(
     id="adhesion",
+    description=__doc__,
     term="contact ends at F_j = -force",
+    pull_off="force",
     parameters=(
         EffectParameter("force", "N", 0.0, 1e9, 0.0, 100.0, "Tension at which contact ends."),
     ),
-    acts="force",
     place="bumpers",
-    is_threshold=True,
     residual=(
         "Tension in the load cells just before each release, which comes later; nothing in "
         "compression."

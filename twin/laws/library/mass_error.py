@@ -6,31 +6,19 @@ Motion alone cannot distinguish it from a factor on K, C, K_j and C_j together: 
 only if a force is measured, because the forces themselves stay those of K, C, K_j and C_j.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from twin.laws.effect import Effect, EffectParameter
 
-from twin.model.effects.effect import Effect, EffectParameter
-
-if TYPE_CHECKING:
-    from twin.model.parameters import Parameters
-
-
-def _change(parameters: "Parameters", values: Mapping[str, float]) -> "Parameters":
-    return replace(parameters, mass=parameters.mass / values["ratio"])
-
-
-MASS_ERROR = Effect(
+EFFECT = Effect(
     id="mass_error",
+    description=__doc__,
     term="ratio on all forces over mass",
+    changes={"mass": "mass / ratio"},
     parameters=(
         EffectParameter(
             "ratio", "", 0.5, 2.0, 1.0, 1.05, "Assumed mass over true mass, forces kept."
         ),
     ),
-    acts="parameters",
     place="mass",
-    change=_change,
     residual=(
         "Acceleration off in proportion to the whole force, resonance moved by its root, in flight "
         "and in contact alike; load cells against M a off by the same factor."

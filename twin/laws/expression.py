@@ -1,9 +1,9 @@
-"""Expressions of effect files: a small grammar, checked for names and units, without `eval`.
+"""Expressions of laws: a small grammar, checked for names and units, without `eval`.
 
 An expression is arithmetic (+ - * / **), numbers, names and the functions of `FUNCTIONS`, written
 as in Python. The parsed tree is checked node by node; anything else (attributes, subscripts,
-strings, other calls) is refused. It is evaluated on arrays, and becomes a function of plain Python
-that numba compiles, from the same tree.
+strings, other calls) is refused. It is evaluated on arrays, and written as plain Python that numba
+compiles, from the same tree.
 """
 
 import ast
@@ -13,8 +13,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from types import CodeType, FunctionType
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -37,10 +36,11 @@ DIMENSIONLESS: Dimension = (0.0, 0.0, 0.0)
 FUNCTIONS: Mapping[str, tuple[Callable[..., float], Callable[..., Any], int]] = {
     "abs": (abs, np.abs, 1),
     # +1 or -1, at a zero that of the zero: a force law has a side at a reversal. Of one number it
-    # is called with 1.0 before its argument, see `build_function`: numba knows no such sign.
+    # is called with 1.0 before its argument, see `write_source`: numba knows no such sign.
     "sign": (math.copysign, lambda x: np.copysign(1.0, x), 1),
     "sqrt": (math.sqrt, np.sqrt, 1),
     "exp": (math.exp, np.exp, 1),
+    "expm1": (math.expm1, np.expm1, 1),
     "log": (math.log, np.log, 1),
     "sin": (math.sin, np.sin, 1),
     "cos": (math.cos, np.cos, 1),
@@ -76,10 +76,16 @@ class Expression:
         with np.errstate(all="ignore"):
             return _evaluate(self.tree, values)
 
-    def find_dimension(self, units: Mapping[str, str]) -> Dimension:
-        """Return the exponents of kg, m and s for units of the names; InputError at a mismatch."""
-        dimensions = {name: parse_unit(unit) for name, unit in units.items()}
+    def find_dimension(self, dimensions: Mapping[str, Dimension]) -> Dimension:
+        """Return the exponents of kg, m and s, from those of the names; InputError if none."""
         return _DimensionCheck(dimensions, self.text).find(self.tree)
+
+    def write_source(self, names: Mapping[str, str]) -> str:
+        """Return plain Python for it, for numbers, with other names: "q" or "c[0]" for a name.
+
+        "sign(v)" in `names` replaces the sign of v. `build_function` makes a function of such text.
+        """
+        return ast.unparse(_SourceWriter(names).visit(copy.deepcopy(self.tree)))
 
 
 def parse_expression(text: str, known_names: Sequence[str]) -> Expression:
@@ -293,62 +299,41 @@ def _combine(first: Dimension, second: Dimension, power: float) -> Dimension:
     return (a, b, c)
 
 
-def build_function(
-    name: str,
-    arguments: Sequence[str],
-    result: Expression | Sequence[Expression],
-    places: Mapping[str, tuple[str, int]],
-    renamed: Mapping[str, str],
-) -> Callable[..., Any]:
-    """Return a function of plain Python: of one expression a number, of several a tuple.
+class _SourceWriter(ast.NodeTransformer):
+    """Renames names; numbers become floats, but integer exponents integers: products, compiled."""
 
-    `places` gives, for a name that is no argument, the tuple argument and the index that hold it;
-    `renamed` the argument of a name that is called otherwise.
-    The function is built from the checked trees; no text is executed.
-    """
+    def __init__(self, names: Mapping[str, str]) -> None:
+        self.names = names
 
-    class Placing(ast.NodeTransformer):
-        def visit_Name(self, node: ast.Name) -> ast.expr:
-            if node.id not in places:
-                return ast.Name(renamed.get(node.id, node.id), ast.Load())
-            holder, index = places[node.id]
-            return ast.Subscript(ast.Name(holder, ast.Load()), ast.Constant(index), ast.Load())
+    def visit_Name(self, node: ast.Name) -> ast.expr:
+        return ast.Name(self.names.get(node.id, node.id), ast.Load())
 
-        def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
-            left, right = self.visit(node.left), self.visit(node.right)
-            exponent = _find_constant(node.right) if isinstance(node.op, ast.Pow) else None
-            if exponent is not None and exponent.is_integer():  # compiled to products
-                right = ast.Constant(int(exponent))
-            return ast.BinOp(left, node.op, right)
+    def visit_BinOp(self, node: ast.BinOp) -> ast.expr:
+        left, right = self.visit(node.left), self.visit(node.right)
+        exponent = _find_constant(node.right) if isinstance(node.op, ast.Pow) else None
+        if exponent is not None and exponent.is_integer():
+            right = ast.Constant(int(exponent))
+        return ast.BinOp(left, node.op, right)
 
-        def visit_Constant(self, node: ast.Constant) -> ast.expr:
-            return ast.Constant(float(node.value))  # type: ignore[arg-type]
+    def visit_Constant(self, node: ast.Constant) -> ast.expr:
+        return ast.Constant(float(node.value))  # type: ignore[arg-type]
 
-        def visit_Call(self, node: ast.Call) -> ast.expr:
-            arguments = [self.visit(part) for part in node.args]
-            if isinstance(node.func, ast.Name) and node.func.id == "sign":
-                arguments.insert(0, ast.Constant(1.0))
-            return ast.Call(node.func, arguments, [])
+    def visit_Call(self, node: ast.Call) -> ast.expr:
+        if replacement := self.names.get(ast.unparse(node)):
+            return ast.Name(replacement, ast.Load())
+        arguments = [self.visit(part) for part in node.args]
+        if isinstance(node.func, ast.Name) and node.func.id == "sign":
+            arguments.insert(0, ast.Constant(1.0))
+        return ast.Call(node.func, arguments, [])
 
-    def place(expression: Expression) -> ast.expr:
-        placed: ast.expr = Placing().visit(copy.deepcopy(expression.tree))
-        return placed
 
-    body = (
-        place(result)
-        if isinstance(result, Expression)
-        else ast.Tuple([place(part) for part in result], ast.Load())
+def build_function(text: str) -> FunctionType:
+    """Return the function of a definition in plain Python that is made of checked expressions."""
+    # The name of a module: a kernel's fingerprint leaves out functions of none.
+    namespace: dict[str, Any] = {"__name__": __name__}
+    namespace |= {function: entry[0] for function, entry in FUNCTIONS.items()}
+    exec(text, namespace)
+    built: FunctionType = next(
+        item for item in namespace.values() if isinstance(item, FunctionType)
     )
-    parameters = ast.arguments(
-        [], [ast.arg(argument) for argument in arguments], None, [], [], None, []
-    )
-    definition = ast.FunctionDef(name, parameters, [ast.Return(body)], [], None)
-    module = ast.fix_missing_locations(ast.Module([definition], []))
-    code = compile(module, f"<{name}>", "exec")
-    return _make_function(next(part for part in code.co_consts if isinstance(part, CodeType)))
-
-
-@cache
-def _make_function(code: CodeType) -> FunctionType:
-    """Return the function of a code, one object of equal ones: a compiled law is known by it."""
-    return FunctionType(code, {function: entry[0] for function, entry in FUNCTIONS.items()})
+    return built

@@ -10,40 +10,24 @@ adds up. Passive: power >= Fc |u'|. ratio = 1 is Coulomb friction. Source: Strib
 exponential form Bo and Pavelescu 1982, Wear 82(3).
 """
 
-import math
-from collections.abc import Mapping
+from twin.laws.effect import Effect, EffectParameter
 
-from twin.model.effects.effect import Effect, EffectParameter
-from twin.model.parameters import Parameters
-
-
-def force(w: float, c: tuple[float, ...]) -> float:
-    """Return friction less that of the break-away in N; c as in `_constants`."""
-    fall = c[0] * math.expm1(-((w / c[1]) ** 2))
-    return fall if w > 0.0 else -fall
-
-
-def _constants(_: Parameters, values: Mapping[str, float]) -> tuple[float, ...]:
-    """Return (fall of the friction in N, speed in m/s)."""
-    return values["fc"] * (values["ratio"] - 1.0), values["speed"]
-
-
-STRIBECK_FRICTION = Effect(
+EFFECT = Effect(
     id="stribeck_friction",
+    description=__doc__,
     term="Fc (1 + (ratio - 1) exp(-(u' / speed)^2)) sign(u')",
+    constants={"fall": "fc * (ratio - 1)"},
+    force="fall * expm1(-((v / speed) ** 2)) * sign(v)",
+    break_away="fc * ratio",
     parameters=(
         EffectParameter("fc", "N", 0.0, 1e9, 0.0, 40.0, "Friction force during fast slip."),
         EffectParameter("ratio", "", 1.0, 30.0, None, 3.0, "Break-away force over Fc."),
         EffectParameter("speed", "m/s", 1e-5, 1e3, None, 0.02, "At which it has fallen by 63 %."),
     ),
-    acts="force",
-    is_dry_friction=True,
     limits=("coulomb_friction",),
     residual=(
         "As Coulomb friction, with a peak at each reversal: sticks longer and lets go with a jerk; "
         "the loss per cycle grows less than in proportion to the amplitude."
     ),
     confused_with=("coulomb_friction", "bouc_wen"),
-    force=force,
-    constants=_constants,
 )

@@ -6,37 +6,26 @@ Damping is unchanged, so the relaxation times C_j/K_j differ too. If the bumpers
 ratio multiplies their stiffness ratio.
 """
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from twin.laws.effect import Effect, EffectParameter
 
-from twin.model.effects.effect import Effect, EffectParameter
-
-if TYPE_CHECKING:
-    from twin.model.parameters import Parameters
-
-
-def _change(parameters: "Parameters", values: Mapping[str, float]) -> "Parameters":
-    total = parameters.bumper_stiffness_r + parameters.bumper_stiffness_l
-    ratio = values["ratio"] * parameters.bumper_stiffness_r / parameters.bumper_stiffness_l
-    return replace(
-        parameters,
-        bumper_stiffness_r=total * ratio / (1 + ratio),
-        bumper_stiffness_l=total / (1 + ratio),
-    )
-
-
-BUMPER_ASYMMETRY = Effect(
+EFFECT = Effect(
     id="bumper_asymmetry",
+    description=__doc__,
     term="K_R u_R on the right, K_L u_L on the left, K_R/K_L = ratio",
+    constants={
+        "total": "bumper_stiffness_r + bumper_stiffness_l",
+        "share": "ratio * bumper_stiffness_r / bumper_stiffness_l",
+    },
+    changes={
+        "bumper_stiffness_r": "total * share / (1 + share)",
+        "bumper_stiffness_l": "total / (1 + share)",
+    },
     parameters=(
         EffectParameter(
             "ratio", "", 0.2, 5.0, 1.0, 1.2, "Right over left bumper stiffness, K_R/K_L."
         ),
     ),
-    acts="parameters",
     place="bumpers",
-    change=_change,
     residual=(
         "In contact only, of the same sign on both sides: force in proportion to |u_j|, so even "
         "harmonics of the drive. Slopes of the two F_j-v_j loops differ; their feet do not."

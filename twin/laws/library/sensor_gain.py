@@ -4,13 +4,13 @@ Acts on one predicted channel, not on the motion. The restart from the measured 
 from that channel.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-SENSOR_GAIN = Effect(
+EFFECT = Effect(
     id="sensor_gain",
+    description=__doc__,
     term="reading = gain x value, of one channel",
     parameters=(EffectParameter("gain", "", 0.2, 5.0, 1.0, 1.05, "Reading over true value."),),
-    acts="sensor",
     place="sensor",
     residual=(
         "In proportion to the channel itself, in flight and in contact; the motion channels become "

@@ -4,13 +4,13 @@ Acts on one predicted channel, not on the motion; values between samples come fr
 four of them. Until the first prediction is as old as the lag the reading is unknown (NaN).
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-SENSOR_LAG = Effect(
+EFFECT = Effect(
     id="sensor_lag",
+    description=__doc__,
     term="reading(t) = value(t - lag), of one channel",
     parameters=(EffectParameter("lag", "s", 0.0, 0.05, 0.0, 1e-3, "Delay of the reading."),),
-    acts="sensor",
     place="sensor",
     residual=(
         "In proportion to the rate of change of the channel, so it grows with frequency; the "

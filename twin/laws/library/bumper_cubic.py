@@ -6,23 +6,17 @@ Conservative: stored kc u_j^4 / 4. Compared with `bumper_hardening`, u_j |u_j|, 
 small depth and steeper at large. Source: Taylor expansion of an elastic law.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(q: float, c: tuple[float, ...]) -> float:
-    """Return kc d^3 in N, d the compression in m."""
-    return c[0] * q * q * q
-
-
-BUMPER_CUBIC = Effect(
+EFFECT = Effect(
     id="bumper_cubic",
+    description=__doc__,
     term="kc u_j^3 in each bumper",
+    force="kc * d * d * d",
     parameters=(
         EffectParameter("kc", "N/m3", 0.0, 1e15, 0.0, 4e10, "Coefficient of the depth cubed."),
     ),
-    acts="force",
     place="bumpers",
     residual="In contact only: peak force grows with the cube of the depth; nothing near touch.",
     confused_with=("bumper_hardening", "hunt_crossley"),
-    force=force,
 )

@@ -8,20 +8,14 @@ else it slips the other way; it starts to slip when that force reaches Fc. Both 
 in time, so there is no chatter and no regularizing slope. Source: Coulomb.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(direction: float, fc: float) -> float:
-    """Return Fc sign(u') in N during slip; `direction` = +1 or -1 is the sign of u', 0 if stuck."""
-    return fc * direction
-
-
-COULOMB_FRICTION = Effect(
+EFFECT = Effect(
     id="coulomb_friction",
+    description=__doc__,
     term="Fc sign(u')",
+    break_away="fc",
     parameters=(EffectParameter("fc", "N", 0.0, 1e9, 0.0, 50.0, "Friction force during slip."),),
-    acts="force",
-    is_dry_friction=True,
     residual=(
         "Loss per cycle in proportion to amplitude, so equivalent damping falls as 1/amplitude; "
         "odd harmonics in phase with u'; at small motion the mass does not move at all."

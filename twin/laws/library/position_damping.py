@@ -5,23 +5,17 @@
 Passive: power cu u^2 u'^2. Source: van der Pol's damping without its negative part.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(q: float, w: float, c: tuple[float, ...]) -> float:
-    """Return cu u^2 u' in N."""
-    return c[0] * q * q * w
-
-
-POSITION_DAMPING = Effect(
+EFFECT = Effect(
     id="position_damping",
+    description=__doc__,
     term="cu u^2 u'",
+    force="cu * u * u * v",
     parameters=(EffectParameter("cu", "N s/m3", 0.0, 1e14, 0.0, 3e6, "Damping per u squared."),),
-    acts="force",
     residual=(
         "Equivalent damping grows as amplitude^2, the same at every frequency; third harmonic in "
         "phase with u'; present in flight."
     ),
     confused_with=("quadratic_damping", "hunt_crossley"),
-    force=force,
 )

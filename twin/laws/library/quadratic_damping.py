@@ -5,21 +5,17 @@
 Odd in u', passive: power c2 |u'|^3 >= 0. Its slope has a kink where u' changes sign.
 """
 
-from twin.model.effects.effect import Effect, EffectParameter
+from twin.laws.effect import Effect, EffectParameter
 
-
-def force(v: float, direction: float, c2: float) -> float:
-    """Return c2 v |v| in N, v in m/s; `direction` = +1 or -1 is the sign of v until a reversal."""
-    return c2 * v * v * direction
-
-
-QUADRATIC_DAMPING = Effect(
+EFFECT = Effect(
     id="quadratic_damping",
+    description=__doc__,
     term="c2 u' |u'| in the damper",
+    force="c2 * v * v * sign(v)",
+    compiled={"c2": "c2"},
     parameters=(
         EffectParameter("c2", "N s2/m2", 0.0, 1e12, 0.0, 2e3, "Coefficient of speed squared."),
     ),
-    acts="force",
     residual=(
         "Equivalent damping grows in proportion to amplitude times frequency; odd harmonics in "
         "phase with u'; nothing at low speed."

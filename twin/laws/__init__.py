@@ -1,0 +1,1 @@
+"""A force law, once: place, parameters with units and bounds, force and rates as expressions."""
