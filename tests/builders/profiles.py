@@ -2,7 +2,9 @@
 
 from typing import Any
 
-from table_io.config.profile import Profile, Specimen
+from table_io.config.base import PROFILES_DIR
+from table_io.config.excitation.stepped_sine import Sweep
+from table_io.config.profile import Profile, Specimen, load_profile
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 GRID = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 4, "measured_cycles": 2}
@@ -28,3 +30,20 @@ def make_history_profile(kind: str, **excitation: Any) -> Profile:
     specimen = {"mass_kg": 550.0, "gap_mm": 4.0}
     raw = {"title": kind, "specimen": specimen, "excitation": {"kind": kind, **excitation}}
     return Profile.model_validate(raw)
+
+
+def read_shipped_profile(name: str, **tables: dict[str, Any]) -> Profile:
+    """Return a shipped test, with other values in some of its tables."""
+    raw = load_profile(PROFILES_DIR / "tests" / f"{name}.toml")[0].model_dump()
+    for table, values in tables.items():
+        raw[table].update(values)
+    return Profile.model_validate(raw)
+
+
+def list_shipped_sweeps() -> list[str]:
+    """Return the names of the shipped tests that are stepped sines."""
+    return sorted(
+        path.stem
+        for path in (PROFILES_DIR / "tests").glob("*.toml")
+        if isinstance(load_profile(path)[0].excitation, Sweep)
+    )

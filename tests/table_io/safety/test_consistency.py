@@ -50,24 +50,9 @@ def acceleration_of(cycles: float) -> float:
     return AMPLITUDE_M * (2 * math.pi * cycles / 1.5) ** 2
 
 
-@LAW
-@given(RATES, st.floats(3.0, 8.0), PHASES, SIGNS)
-def test_both_amplitudes_are_those_of_the_tone_with_its_phase(
-    rate_hz: float, cycles: float, phase: float, sign: float
-) -> None:
-    pair = make_pair(rate_hz, cycles, phase, position=sign * 0.05)
-    size = acceleration_of(cycles)
-    for amplitude in (pair.displacement[1], pair.acceleration[1]):
-        assert amplitude == pytest.approx(-size, rel=1e-2)  # in phase with the window: no angle
-    assert pair.size == pytest.approx(size, rel=1e-2)
-    assert pair.mismatch < 1e-6 * size
-    assert pair.fundamental_mismatch < 1e-6 * size
-    assert pair.constant[0] == pytest.approx(1.0)
-
-
 @settings(max_examples=8, derandomize=True)
 @given(RATES, st.floats(2.0, 5.0), PHASES, st.floats(0.0, 6.0), st.integers(0, 99))
-def test_the_test_functions_take_the_derivatives_of_any_motion(
+def test_compare_motion_takes_derivatives_by_parts(
     rate_hz: float, cycles: float, phase: float, low_cut: float, seed: int
 ) -> None:
     """Integration by parts: phi' x is -phi x', and phi'' x is phi x'', at all three orders."""
@@ -100,7 +85,7 @@ def test_the_test_functions_take_the_derivatives_of_any_motion(
 
 @LAW
 @given(RATES, st.floats(0.001, 0.3), SIGNS)
-def test_a_gain_is_a_mismatch_in_both_directions(rate_hz: float, error: float, sign: float) -> None:
+def test_mismatch_of_a_gain(rate_hz: float, error: float, sign: float) -> None:
     pair = make_pair(rate_hz, gain=1.0 + sign * error)
     expected = error * acceleration_of(3.0)
     assert pair.mismatch == pytest.approx(expected, rel=1e-2)
@@ -114,9 +99,7 @@ def test_a_gain_is_a_mismatch_in_both_directions(rate_hz: float, error: float, s
 
 @LAW
 @given(RATES, st.floats(0.01, 2.0), SIGNS, PHASES)
-def test_an_offset_is_found_with_its_sign_and_explains_all(
-    rate_hz: float, size: float, sign: float, phase: float
-) -> None:
+def test_offset_with_its_sign(rate_hz: float, size: float, sign: float, phase: float) -> None:
     pair = make_pair(rate_hz, 3.4, phase, offset=sign * size)
     assert pair.offset == pytest.approx(sign * size, rel=1e-6)
     assert pair.mismatch_without_offset < 1e-6
@@ -124,7 +107,7 @@ def test_an_offset_is_found_with_its_sign_and_explains_all(
     assert pair.average > 0.9 * size - 0.02 * acceleration_of(3.4)
 
 
-def test_the_standard_error_of_an_offset_is_that_of_many_draws() -> None:
+def test_sigma_offset_is_the_scatter_of_draws() -> None:
     chance = np.random.default_rng(5)
     pair = make_pair(1000.0, 3.4)
     sigma = np.array([0.02, 0.05, 0.1])
@@ -137,7 +120,7 @@ def test_the_standard_error_of_an_offset_is_that_of_many_draws() -> None:
 
 @pytest.mark.parametrize("order", [0, 1, 2])
 @pytest.mark.parametrize("sign", [-1.0, 1.0, 1.0j])
-def test_a_mismatch_is_in_the_orders_that_no_offset_spoils(order: int, sign: complex) -> None:
+def test_mismatch_leaves_out_the_average(order: int, sign: complex) -> None:
     """Of the three orders the average is left out, and of the others the largest is taken."""
     values = np.array([2.0, 3.0, 4.0], dtype=np.complex128)
     zeros = np.zeros(3, dtype=np.complex128)
@@ -157,19 +140,9 @@ def test_a_mismatch_is_in_the_orders_that_no_offset_spoils(order: int, sign: com
         assert pair.average == pytest.approx(max(averages))
 
 
-def test_at_a_standstill_without_noise_there_is_nothing_to_compare() -> None:
-    zeros = np.zeros(3, dtype=np.complex128)
-    pair = WeakFormPair(zeros, zeros, zeros + 1.0, np.zeros(3), zeros, zeros)
-    assert not pair.is_clear
-    # The threshold itself is not clear, be it of the noise or of the motion.
-    clear = replace(pair, displacement=np.array([0.0, 20.0, 0.0]), sigma=np.full(3, 1.0))
-    assert not clear.is_clear
-    assert replace(clear, sigma=np.full(3, np.nextafter(1.0, 0.0))).is_clear
-
-
 @LAW
 @given(st.floats(0.01, 100.0), st.floats(1e-4, 10.0), st.integers(0, 99))
-def test_equations_are_weighted_by_the_error_of_motion_and_noise(
+def test_normal_equations_are_weighted_without_offset(
     scale: float, noise: float, seed: int
 ) -> None:
     """In units of hypot(1 % of the largest amplitude, standard error), an offset eliminated."""
@@ -191,7 +164,7 @@ def test_equations_are_weighted_by_the_error_of_motion_and_noise(
 
 @LAW
 @given(RATES, st.floats(1e-5, 1e-2), st.floats(1e-3, 1.0))
-def test_the_errors_are_those_of_white_noise(rate_hz: float, in_m: float, in_m_s2: float) -> None:
+def test_sigma_of_white_noise(rate_hz: float, in_m: float, in_m_s2: float) -> None:
     quiet, first, second, both = (
         make_pair(rate_hz, noise=noise).sigma
         for noise in ((0.0, 0.0), (in_m, 0.0), (0.0, in_m_s2), (in_m, in_m_s2))
@@ -207,9 +180,7 @@ def test_the_errors_are_those_of_white_noise(rate_hz: float, in_m: float, in_m_s
 
 @pytest.mark.parametrize("limit", ["noise", "motion"])
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_a_ratio_is_evaluated_from_twenty_errors_and_a_third_of_the_motion(
-    limit: str, sign: float
-) -> None:
+def test_is_clear_at_its_thresholds(limit: str, sign: float) -> None:
     pair = make_pair(1000.0)
     for factor in (0.98, 1.02):
         amplitudes = np.array([0.0, sign, 0.0], dtype=np.complex128)
@@ -220,11 +191,14 @@ def test_a_ratio_is_evaluated_from_twenty_errors_and_a_third_of_the_motion(
             amplitudes[2] = 1.0 / (factor * MIN_AMPLITUDE_RATIO)
         planted = replace(pair, displacement=amplitudes, acceleration=0 * amplitudes, sigma=sigma)
         assert planted.is_clear == (factor > 1.0)
+    # The threshold itself is not clear.
+    exact = replace(pair, displacement=np.array([0.0, 20.0, 0.0]), sigma=np.full(3, 1.0))
+    assert not exact.is_clear
 
 
 @LAW
 @given(st.floats(-2.0, 2.0), st.floats(-2e-3, 2e-3), st.floats(0.9, 1.1), st.floats(-4.0, 4.0))
-def test_low_cut_and_delay_are_fitted_and_removed(
+def test_remove_errors_of_low_cut_and_delay(
     low_cut: float, delay_s: float, gain: float, offset: float
 ) -> None:
     chance = np.random.default_rng(7)
@@ -248,7 +222,7 @@ def test_low_cut_and_delay_are_fitted_and_removed(
 
 @LAW
 @given(st.floats(0.0, 0.2), st.floats(1e-5, 1e-3), SIGNS, st.floats(-4.0, 4.0))
-def test_phase_errors_are_fitted_at_a_gain_of_one_from_the_motion_alone(
+def test_fit_phase_errors_at_a_gain_of_one(
     low_cut: float, size_s: float, sign: float, offset: float
 ) -> None:
     chance = np.random.default_rng(8)
@@ -265,7 +239,7 @@ def test_phase_errors_are_fitted_at_a_gain_of_one_from_the_motion_alone(
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_the_size_is_that_of_either_sensor_in_either_order(order: int) -> None:
+def test_size_is_the_largest_amplitude(order: int) -> None:
     pair = make_pair(1000.0)
     amplitudes = np.array([9.0, 1.0, 1.0], dtype=np.complex128)
     large = amplitudes.copy()
@@ -276,9 +250,7 @@ def test_the_size_is_that_of_either_sensor_in_either_order(order: int) -> None:
 
 @LAW
 @given(st.floats(-math.pi / 4, 3 * math.pi / 4 - 2e-3), st.floats(1.0, 5e3), st.floats(-50.0, 50.0))
-def test_the_share_of_two_cells_is_found_at_any_angle(
-    angle: float, size_n: float, mean_n: float
-) -> None:
+def test_fit_cell_pair_at_any_angle(angle: float, size_n: float, mean_n: float) -> None:
     force = size_n * np.sin(0.1 * np.arange(500))
     force -= force.mean()
     fit = fit_cell_pair(force * math.cos(angle) + mean_n, force * math.sin(angle) - mean_n, 2.0)
@@ -290,20 +262,17 @@ def test_the_share_of_two_cells_is_found_at_any_angle(
 
 
 @pytest.mark.parametrize(("below", "turned"), [(0.9e-3, 0.0), (1.1e-3, math.pi), (0.3, math.pi)])
-def test_only_noise_about_a_reversed_cell_is_not_turned_round(below: float, turned: float) -> None:
+def test_fit_cell_pair_of_a_reversed_cell(below: float, turned: float) -> None:
     angle = -math.pi / 4 - below
     force = np.sin(0.1 * np.arange(500))
     fit = fit_cell_pair(force * math.cos(angle), force * math.sin(angle), 0.0)
     assert fit.angle == pytest.approx(angle + turned, abs=1e-9)
-
-
-def test_cells_without_force_have_no_share() -> None:
     assert fit_cell_pair(np.full(9, 3.0), np.full(9, 4.0), 1.0).sigma_angle == math.inf
 
 
 @LAW
 @given(SIGNS, st.integers(1, 8), st.sampled_from([0, 1]), st.floats(1.05, 50.0), SIGNS)
-def test_a_spike_is_the_median_of_three(
+def test_remove_spikes_by_the_median_of_three(
     sign: float, place: int, channel: int, size: float, slope: float
 ) -> None:
     clean = slope * np.vstack([np.arange(10.0), 3.0 * np.arange(10.0)])

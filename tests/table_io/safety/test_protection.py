@@ -1,11 +1,13 @@
-"""Protection on a table that follows its command exactly, with one thing wrong at a time.
+"""Protection over whole runs: a table of faults, each with its finding and the time until it.
 
-The specimen is a rigid block without contact, so every channel is known in closed form; what the
-simulated table adds (servo, impacts, chaos) is in test_protection_simulated.py.
+The specimen is a rigid block without contact on a table that follows its command exactly, so that
+every channel is known in closed form. What the simulated table adds (servo, impacts, chaos) is in
+test_protection_simulated.py, each limit to the number in test_sample_checks.py and
+test_cycle_checks.py.
 """
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -26,667 +28,588 @@ from table_io.safety.protection import (
     start_protection,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.builders.rigs import RIG
+from tests.builders.profiles import make_profile
+from tests.builders.rigs import NOISE_SI, RIG
 
-RATE_HZ = 2000.0
 NAMES = RIG.channels
 DRIVE, TABLE, ACC, MASS, MASS_ACC, R1, R2, L1, L2 = range(9)
-FAULT_SAMPLE = 5000  # in the held cycles of the first step, 2 Hz
+RATE_HZ = 2000.0
+FAULT_SAMPLE = 5000  # in the held cycles of the first step, 2 Hz, held from 1.5 s to 6 s
 CYCLE_SAMPLES = 1000
-A = 0.05 * GRAVITY_M_S2
-AMPLITUDE = A / (4 * np.pi) ** 2
-Change = Callable[[Any], None]  # of values, or of what is at its range, (channel, sample)
+HELD_FROM = 3000
+LEVEL_M_S2 = 0.05 * GRAVITY_M_S2
+EVERYTHING = slice(None)
+Change = Callable[[Any], None]  # of values, (channel, sample)
 
 
-def profile(sensor: str = "stop", gap_mm: float = 4.0, **sweep: Any) -> Profile:
-    """2 and 2.5 Hz, nine cycles each; the first step is held from 1.5 s to 6 s."""
-    grid = {"start_hz": 2.0, "stop_hz": 2.5, "step_hz": 0.5, "cycles": 9, "measured_cycles": 8}
-    return Profile.model_validate(
-        {
-            "title": "short",
-            "specimen": {"mass_kg": 550.0, "gap_mm": gap_mm},
-            "sweep": {"directions": ("forward",), **grid, **sweep},
-            "protection": {"sensor": sensor},
-        }
-    )
+def make_test(sensor: str = "stop", gap_mm: float = 4.0, **sweep: Any) -> Profile:
+    """Return a test of 2 and 2.5 Hz, nine cycles each."""
+    grid = {"stop_hz": 2.5, "cycles": 9, "measured_cycles": 8, "directions": ("forward",)}
+    return make_profile(gap_mm, {"protection": {"sensor": sensor}}, **grid | sweep)
 
 
-TEST = profile()
+TEST = make_test()
 PLAN = plan_sweep(TEST)
 
 
-def noises(scale: float = 1.0) -> dict[str, tuple[float, int]]:
-    """What the tare says of each channel."""
-    rms = {sensor.channel: scale * sensor.noise_rms * sensor.si_per_unit for sensor in RIG.sensors}
-    return {name: (value, 2 if value else int(RATE_HZ)) for name, value in rms.items()}
-
-
-def simulate_channels(drive: Drive, scale: float = 1.0, lag: int = 0) -> Float2D:
-    """(channel, sample): table and mass move as one, `lag` samples behind the command."""
-    return _simulate_channels_once(drive, scale, lag).copy()
+def scale_noise(scale: float) -> dict[str, tuple[float, int]]:
+    """Return what the tare measures of each channel."""
+    return {
+        name: (scale * rms, 2 if scale * rms else int(RATE_HZ))
+        for name, (rms, _) in NOISE_SI.items()
+    }
 
 
 @cache
-def _simulate_channels_once(drive: Drive, scale: float, lag: int) -> Float2D:
+def _simulate_once(drive: Drive, scale: float, lag: int) -> Float2D:
     count = drive.rest_start + 1000
     values = np.zeros((len(NAMES), count))
     values[DRIVE] = drive.command(0, count)
     values[[TABLE, MASS]] = drive.command(-lag, count)
     values[[ACC, MASS_ACC]] = drive.acceleration(-lag, count)
     noise = np.random.default_rng(7).standard_normal(values.shape)
-    rms = np.array([[noise_rms] for noise_rms, _ in noises(scale).values()])
+    rms = np.array([[noise_rms] for noise_rms, _ in scale_noise(scale).values()])
     return values + rms * noise
+
+
+def simulate_channels(drive: Drive = PLAN, scale: float = 1.0, lag: int = 0) -> Float2D:
+    """Return (channel, sample): table and mass move as one, `lag` samples behind the command."""
+    return _simulate_once(drive, scale, lag).copy()
+
+
+@cache
+def evaluate_drive(drive: Drive) -> tuple[Any, ...]:
+    """Return labels, command, phase, level and acceleration of every sample that is measured."""
+    span = 0, drive.rest_start + 1000
+    return (
+        drive.labels(*span),
+        drive.command(*span),
+        np.unwrap(drive.phase(*span), period=1.0),
+        drive.level(*span),
+        drive.demanded_acceleration(*span),
+    )
+
+
+def observe(values: Float2D, at_range: Any, drive: Drive, first: int, count: int) -> Observation:
+    window = slice(first, min(first + count, values.shape[1]))
+    labels, *demands = evaluate_drive(drive)
+    part = values[:, window].copy()
+    block = Block("meas", first, RATE_HZ, NAMES, part, *(label[window] for label in labels))
+    return Observation(block, at_range[:, window], *(demand[window] for demand in demands))
 
 
 def list_findings(
     change: Change | None = None,
     test: Profile = TEST,
     drive: Drive = PLAN,
-    clipped: Change | None = None,
+    at_range: Change | None = None,
     cut: int = 100,
     scale: float = 1.0,
     lag: int = 0,
     known: FrequencyResponse | None = None,
+    noisy: tuple[int, ...] = tuple(range(9)),
     last: int | None = None,
-) -> tuple[Finding, ...]:
-    """All findings of a run in which `change` has been made to what was measured."""
+) -> list[Finding]:
+    """Return all findings of a run in which `change` was made; `noisy`: rows that have noise."""
     values = simulate_channels(drive, scale, lag)
-    at_range = np.zeros(values.shape, dtype=np.bool_)
+    quiet = [row for row in range(len(NAMES)) if row not in noisy]
+    values[quiet] = simulate_channels(drive, 0.0, lag)[quiet]
+    clipped = np.zeros(values.shape, dtype=np.bool_)
     if change is not None:
         change(values)
-    if clipped is not None:
-        clipped(at_range)
-    guard = start_protection(test, RIG, noises(scale))
+    if at_range is not None:
+        at_range(clipped)
+    noise = {
+        name: entry for name, entry in scale_noise(scale).items() if NAMES.index(name) in noisy
+    }
+    guard = start_protection(test, RIG, noise)
     if known is not None:
         guard = set_response(guard, known)
     findings: list[Finding] = []
-    values, at_range = values[:, :last], at_range[:, :last]
+    values = values[:, :last]
     for first in range(0, values.shape[1], cut):
-        guard, some = inspect_samples(guard, make_observation(values, at_range, drive, first, cut))
+        guard, some = inspect_samples(guard, observe(values, clipped, drive, first, cut))
         findings += some
-    return tuple(findings)
+    return findings
 
 
-@cache
-def evaluate_drive(drive: Drive) -> tuple[Any, ...]:
-    """Labels, command, phase, level and acceleration of every sample that is measured."""
-    where = 0, drive.rest_start + 1000
-    return (
-        drive.labels(*where),
-        drive.command(*where),
-        np.unwrap(drive.phase(*where), period=1.0),
-        drive.level(*where),
-        drive.demanded_acceleration(*where),
-    )
+def put(rows: Any, value: Any, count: int | None = None, first: int = FAULT_SAMPLE) -> Change:
+    """Set samples of channels."""
 
-
-def make_observation(
-    values: Float2D, clipped: Any, drive: Drive, first: int, cut: int
-) -> Observation:
-    window = slice(first, min(first + cut, values.shape[1]))
-    labels, *rest = evaluate_drive(drive)
-    values = values[:, window].copy()
-    block = Block("meas", first, RATE_HZ, NAMES, values, *(label[window] for label in labels))
-    return Observation(block, clipped[:, window], *(demand[window] for demand in rest))
-
-
-def steady(drive: Drive) -> tuple[Any, Any, Any]:
-    """(phase in rad, level, frequency in Hz where it is held, else inf), (sample,) each."""
-    labels, _, phase, level, _ = evaluate_drive(drive)
-    held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
-    f = np.where(held, np.abs(np.gradient(phase)) * RATE_HZ, np.inf)
-    return 2 * np.pi * phase, level, f
-
-
-def put(rows: Any, first: int, value: Any, count: int | None = None) -> Change:
-    """Sets samples of a channel."""
-
-    def change(values: Float2D) -> None:
+    def change(values: Any) -> None:
         values[rows, first : None if count is None else first + count] = value
 
     return change
 
 
-def add(rows: Any, first: int, value: Any, count: int | None = None) -> Change:
-    def change(values: Float2D) -> None:
+def add(rows: Any, value: Any, count: int | None = None, first: int = FAULT_SAMPLE) -> Change:
+    """Add to samples of channels."""
+
+    def change(values: Any) -> None:
         values[rows, first : None if count is None else first + count] += value
 
     return change
 
 
-def scale_rows(rows: Any, first: int, factor: float, last: int | None = None) -> Change:
-    def change(values: Float2D) -> None:
-        values[rows, first:last] *= factor
+def multiply(rows: Any, factor: float, first: int = FAULT_SAMPLE) -> Change:
+    """Multiply channels from a sample on."""
+
+    def change(values: Any) -> None:
+        values[rows, first:] *= factor
 
     return change
 
 
-def kinds(findings: tuple[Finding, ...], stop: bool | None = None) -> list[str]:
-    return [finding.kind for finding in findings if stop is None or finding.stop == stop]
+def combine(*changes: Change) -> Change:
+    """Make several changes, one after another."""
 
-
-def first(findings: tuple[Finding, ...], kind: str) -> Finding:
-    return next(finding for finding in findings if finding.kind == kind)
-
-
-# A table that does what it should
-
-
-@pytest.mark.parametrize("scale", [0.0, 0.2, 1.0, 3.0])
-def test_a_sound_run_has_no_findings(scale: float) -> None:
-    assert list_findings(scale=scale) == ()
-    assert list_findings(scale=scale, lag=30) == ()
-
-
-@pytest.mark.parametrize("gap_mm", [-10.0, 0.0, float("inf")])
-def test_nor_has_it_with_another_gap(gap_mm: float) -> None:
-    assert list_findings(test=profile(gap_mm=gap_mm)) == ()
-
-
-# Limits
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-@pytest.mark.parametrize(
-    ("row", "value", "kind"),
-    [
-        (TABLE, 0.0602, "stroke"),
-        (ACC, 1.02 * GRAVITY_M_S2, "acceleration"),
-        (MASS_ACC, (30e3 + 2000.0 * 2 * A) / 550.0, "force"),
-    ],
-)
-def test_an_excess_stops_within_three_samples(
-    row: int, value: float, kind: str, sign: float
-) -> None:
-    findings = list_findings(put(row, FAULT_SAMPLE, sign * value))
-    trip = first(findings, kind)
-    assert trip.stop
-    assert FAULT_SAMPLE < trip.index <= FAULT_SAMPLE + 2
-    assert np.sign(trip.value) == sign
-    assert abs(trip.value) > trip.limit
-
-
-@pytest.mark.parametrize("value", [0.0602, -0.2, 5.0])
-def test_a_spike_of_one_sample_is_no_motion(value: float) -> None:
-    findings = list_findings(add(TABLE, FAULT_SAMPLE, value, 1))
-    assert [(finding.index, finding.kind, finding.stop) for finding in findings] == [
-        (FAULT_SAMPLE, "spike", False)
-    ]
-    assert findings[0].value == pytest.approx(abs(value), rel=1e-2)
-
-
-def test_just_within_its_limits_a_table_may_move() -> None:
-    def change(values: Float2D) -> None:
-        values[TABLE, FAULT_SAMPLE:] = 0.0598
-
-    assert "stroke" not in kinds(list_findings(change))
-
-
-def test_velocity_is_that_of_the_displacement() -> None:
-    ramp = np.arange(100) / RATE_HZ
-
-    def speed(v: float) -> tuple[Finding, ...]:
-        def change(values: Float2D) -> None:
-            values[TABLE, FAULT_SAMPLE : FAULT_SAMPLE + 100] += v * ramp
-            values[TABLE, FAULT_SAMPLE + 100 :] += v * ramp[-1]
-
-        return list_findings(change)
-
-    assert "velocity" not in kinds(speed(0.45))
-    trip = first(speed(0.55), "velocity")
-    assert trip.stop
-    assert trip.index <= FAULT_SAMPLE + 22  # 10 ms, and a sample for the median
-    assert 0.5 < trip.value < 0.6
-
-
-def test_force_counts_the_mass_only_where_it_is_measured() -> None:
-    lost = list_findings(put(MASS_ACC, FAULT_SAMPLE, np.nan))
-    assert "force" not in kinds(lost)
-    table_alone = 30e3 / 2000.0 - 550.0 / 2000.0 * A
-    assert "force" in kinds(list_findings(put(ACC, FAULT_SAMPLE, table_alone + 0.2)))
-
-    def both(values: Float2D) -> None:
-        values[MASS_ACC, FAULT_SAMPLE:] = np.nan
-        values[ACC, FAULT_SAMPLE:] = 30e3 / 2000.0 + 0.1
-
-    assert "force" in kinds(list_findings(both))
-
-
-# Sensors, sample by sample
-
-
-def test_a_sensor_at_its_range_is_no_longer_believed() -> None:
-    mark = put(MASS, FAULT_SAMPLE, True, 3)
-    (finding,) = list_findings(clipped=mark)
-    assert (finding.kind, finding.channel, finding.index, finding.stop) == (
-        "rail",
-        "mass_disp_m",
-        FAULT_SAMPLE + 2,
-        True,
-    )
-    (finding,) = list_findings(clipped=mark, test=profile("warn"))
-    assert not finding.stop
-    assert list_findings(clipped=put(MASS, FAULT_SAMPLE, True, 2)) == ()
-
-
-def test_a_lost_sample_is_told_and_a_lost_sensor_stops() -> None:
-    (finding,) = list_findings(put(TABLE, FAULT_SAMPLE, np.nan, 1))
-    assert (finding.kind, finding.channel, finding.index, finding.stop) == (
-        "lost",
-        "table_disp_m",
-        FAULT_SAMPLE,
-        False,
-    )
-    short, long = (
-        list_findings(put(TABLE, FAULT_SAMPLE, np.nan, 40)),
-        list_findings(put(TABLE, FAULT_SAMPLE, np.nan, 41)),
-    )
-    assert kinds(short, stop=True) == []
-    assert [(finding.kind, finding.index) for finding in long if finding.stop] == [
-        ("lost", FAULT_SAMPLE + 40)
-    ]  # 20 ms
-    assert (
-        kinds(list_findings(put(MASS, FAULT_SAMPLE, np.nan, 41), profile("warn")), stop=True) == []
-    )
-
-
-def test_a_loose_contact_adds_up() -> None:
-    every_third = list_findings(_loose(3))
-    stop = next(finding for finding in every_third if finding.stop)
-    assert stop.kind == "lost"
-    assert stop.index - FAULT_SAMPLE < 0.2 * RATE_HZ
-    assert kinds(list_findings(_loose(20)), stop=True) == []
-
-
-def _loose(every: int) -> Change:
-    def change(values: Float2D) -> None:
-        values[TABLE, FAULT_SAMPLE::every] = np.nan
+    def change(values: Any) -> None:
+        for part in changes:
+            part(values)
 
     return change
 
 
-def test_one_lost_sample_does_not_hide_the_next() -> None:
-    def change(values: Float2D) -> None:
-        values[TABLE, FAULT_SAMPLE] = np.nan
-        values[TABLE, FAULT_SAMPLE + 1 :] = 0.07
+def lose_every(period: int) -> Change:
+    """Lose single samples of the table's displacement, as a loose contact does."""
 
-    assert first(list_findings(change), "stroke").index <= FAULT_SAMPLE + 4
+    def change(values: Any) -> None:
+        values[TABLE, FAULT_SAMPLE::period] = np.nan
 
-
-def test_a_block_that_is_lost_in_all_channels_is_told_once() -> None:
-    (finding,) = list_findings(put(slice(None), FAULT_SAMPLE, np.nan, 20))
-    assert (finding.kind, finding.index, finding.stop) == ("lost", FAULT_SAMPLE, False)
-    assert "all channels" in finding.text
+    return change
 
 
-@pytest.mark.parametrize("row", [TABLE, ACC, MASS, MASS_ACC, R1])
-def test_a_stuck_sensor_is_told_by_its_noise(row: int) -> None:
-    findings = list_findings(put(row, FAULT_SAMPLE, 1e-4))
-    assert findings[0].kind == "stuck"
-    assert findings[0].channel == NAMES[row]
-    assert findings[0].index == FAULT_SAMPLE + 19  # 10 ms
-    assert findings[0].stop
-    assert "stuck" not in kinds(list_findings(put(row, FAULT_SAMPLE, 1e-4, 15)))
+def repeat(back: int, count: int) -> Change:
+    """Deliver old samples once more in all channels."""
+
+    def change(values: Any) -> None:
+        for k in range(FAULT_SAMPLE, FAULT_SAMPLE + count):
+            values[:, k] = values[:, k - back]
+
+    return change
 
 
-@pytest.mark.parametrize("row", [DRIVE, TABLE, ACC])
-def test_without_noise_a_sensor_is_stuck_only_where_it_must_move(row: int) -> None:
-    held = simulate_channels(PLAN, 0.0)[row, FAULT_SAMPLE]
-    assert "stuck" in kinds(list_findings(put(row, FAULT_SAMPLE, held), scale=0.0))
-    assert list_findings(put(row, 0, 0.0, 1000), scale=0.0) == ()  # at rest
-    assert list_findings(put(R1, 0, 0.0), scale=0.0) == ()
+def ramp_table(speed_m_s: float) -> Change:
+    """Move the table away for 50 ms."""
+
+    def change(values: Any) -> None:
+        way = speed_m_s * np.minimum(np.arange(values.shape[1] - FAULT_SAMPLE), 100) / RATE_HZ
+        values[TABLE, FAULT_SAMPLE:] += way
+
+    return change
 
 
-@pytest.mark.parametrize("row", [TABLE, ACC, MASS, MASS_ACC, R1])
-def test_a_cable_that_is_off_is_told_by_the_noise_it_lacks(row: int) -> None:
-    noise = noises()[NAMES[row]][0] / 10 * np.random.default_rng(1).standard_normal(4000)
-    finding = first(list_findings(put(row, FAULT_SAMPLE, noise, 4000)), "silent")
-    assert finding.channel == NAMES[row]
-    assert finding.index - FAULT_SAMPLE < 0.15 * RATE_HZ
-    assert "silent" not in kinds(list_findings(put(row, FAULT_SAMPLE, 6.0 * noise, 4000)))
+def delay_command(values: Any) -> None:
+    values[DRIVE, FAULT_SAMPLE:] = values[DRIVE, FAULT_SAMPLE - 20 : -20].copy()
 
 
-@pytest.mark.parametrize("row", [DRIVE, TABLE, ACC, MASS, MASS_ACC, R1, L2])
-def test_a_spike_is_told_and_only_that(row: int) -> None:
+def stop_table(values: Any) -> None:
+    """Let the table and its load stay where they are."""
+    sound = simulate_channels(PLAN, 0.0)
+    place, motion = [TABLE, MASS], [ACC, MASS_ACC]
+    held = sound[place, FAULT_SAMPLE, None]
+    values[place, FAULT_SAMPLE:] += held - sound[place, FAULT_SAMPLE:]
+    values[motion, FAULT_SAMPLE:] -= sound[motion, FAULT_SAMPLE:]
+
+
+def lose_noise(row: int, jump: float = 0.0) -> Change:
+    """Let a channel show its motion without noise, after a jump in units of its noise."""
+
+    def change(values: Any) -> None:
+        values[row, FAULT_SAMPLE:] = simulate_channels(PLAN, 0.0)[row, FAULT_SAMPLE:]
+        values[row, FAULT_SAMPLE] += jump * NOISE_SI[NAMES[row]][0]
+
+    return change
+
+
+def make_noise(row: int, share: float) -> Float2D:
+    """Return noise of a share of that of a channel, (4000,)."""
+    generator = np.random.default_rng(1)
+    noise: Any = share * NOISE_SI[NAMES[row]][0] * generator.standard_normal(4000)
+    return noise
+
+
+def find_spike_limit(row: int) -> float:
+    """Return the limit of a spike in SI: noise or range, and the steps of a stiff table."""
     sensor = RIG.sensors[row]
     limit = max(10 * sensor.noise_rms, 1e-3 * sensor.range) * sensor.si_per_unit
-    limit += RIG.output.lsb_m * 1e6 if row == ACC else 0.0
-    (finding,) = list_findings(add(row, FAULT_SAMPLE, 1.7 * limit, 1))
-    assert (finding.kind, finding.channel, finding.index, finding.stop) == (
-        "spike",
-        NAMES[row],
-        FAULT_SAMPLE,
-        False,
-    )
-    assert list_findings(add(row, FAULT_SAMPLE, 0.4 * limit, 1)) == ()
+    return limit + (RIG.output.lsb_m * 1e6 if row == ACC else 0.0)
 
 
-def test_what_shows_in_two_channels_is_no_spike_of_a_sensor() -> None:
-    assert list_findings(add([R1, R2], FAULT_SAMPLE, 100.0, 1)) == ()
+def press_bumper(share: float, change: Change | None = None) -> Change:
+    """Let the right cells carry the mass part of each cycle, the first one `share` of it."""
 
-
-@pytest.mark.parametrize("back", [7, 20, 333])
-def test_old_samples_once_more_are_no_measurement(back: int) -> None:
-    def again(count: int) -> Change:
-        def change(values: Float2D) -> None:
-            for k in range(FAULT_SAMPLE, FAULT_SAMPLE + count):
-                values[:, k] = values[:, k - back]
-
-        return change
-
-    (finding,) = list_findings(again(15))
-    assert (finding.kind, finding.index, finding.stop) == ("repeated", FAULT_SAMPLE + 4, False)
-    assert finding.value == pytest.approx(back / RATE_HZ)
-    stop = next(finding for finding in list_findings(again(60)) if finding.stop)
-    assert (stop.kind, stop.index <= FAULT_SAMPLE + 50) == ("lost", True)
-
-
-# Command and table
-
-
-def test_a_command_that_comes_later_than_queued_stops() -> None:
-    def change(values: Float2D) -> None:
-        values[DRIVE, FAULT_SAMPLE:] = values[DRIVE, FAULT_SAMPLE - 20 : -20].copy()
-
-    stop = next(finding for finding in list_findings(change) if finding.stop)
-    assert (stop.kind, stop.channel) == ("command", "drive_disp_m")
-    assert stop.index - FAULT_SAMPLE < CYCLE_SAMPLES / 4
-
-
-def test_a_converter_may_be_a_sample_late_and_a_little_off() -> None:
-    def change(values: Float2D) -> None:
-        values[DRIVE] = 1.005 * np.roll(values[DRIVE], 1)
-
-    assert list_findings(change) == ()
-
-
-def test_a_small_command_is_read_back_over_whole_cycles() -> None:
-    small = profile(acceleration_g=0.002)
-    drive = plan_sweep(small)
-    findings = list_findings(scale_rows(DRIVE, FAULT_SAMPLE, 1.05), small, drive)
-    assert {finding.kind for finding in findings if finding.channel == "drive_disp_m"} == {
-        "command"
-    }
-    assert "command" not in kinds(
-        list_findings(scale_rows(DRIVE, FAULT_SAMPLE, 1.01), small, drive)
-    )
-
-
-def test_a_table_that_stays_where_it_is_stops() -> None:
-    def change(values: Float2D) -> None:
-        hold = simulate_channels(PLAN, 0.0)
-        values[[TABLE, MASS], FAULT_SAMPLE:] += (
-            hold[[TABLE, MASS], FAULT_SAMPLE, None] - hold[[TABLE, MASS], FAULT_SAMPLE:]
-        )
-        values[[ACC, MASS_ACC], FAULT_SAMPLE:] -= hold[[ACC, MASS_ACC], FAULT_SAMPLE:]
-
-    stop = next(finding for finding in list_findings(change) if finding.stop)
-    assert (stop.kind, stop.channel) == ("following", "table_disp_m")
-    assert stop.index - FAULT_SAMPLE < CYCLE_SAMPLES / 4
-
-
-def test_before_the_table_is_known_any_lag_within_reason_is_allowed() -> None:
-    assert list_findings(lag=180) == ()  # 90 ms
-    assert "following" in kinds(list_findings(lag=320))
-
-
-# Tracked
-
-
-def test_the_level_is_tracked_on_the_fundamental() -> None:
-    def share(factor: float, alone: bool = False) -> list[Finding]:
-        rows = [ACC] if alone else [TABLE, ACC, MASS, MASS_ACC]
-        return [
-            finding
-            for finding in list_findings(scale_rows(rows, 0, factor))
-            if finding.kind == "level"
-        ]
-
-    assert share(1.08) == share(0.92) == []
-    for factor in (1.12, 0.88):
-        alarm = share(factor)[0]
-        assert not alarm.stop
-        assert alarm.to_event().kind == "alarm"
-        assert alarm.value == pytest.approx(factor * A, rel=1e-2)
-    for factor in (2.1, 0.48):
-        stop = next(finding for finding in share(factor) if finding.stop)
-        assert (
-            2 * CYCLE_SAMPLES <= stop.index - 3000 <= 2.2 * CYCLE_SAMPLES
-        )  # it is held from 1.5 s on
-    assert not any(finding.stop for finding in share(1.9))
-
-
-def test_the_level_is_not_judged_while_blending() -> None:
-    def change(values: Float2D) -> None:
-        blend = PLAN.labels(0, values.shape[1])[1] == Label.BLEND
-        values[np.ix_([TABLE, ACC, MASS, MASS_ACC], blend)] *= 1.13
-
-    assert "level" not in kinds(list_findings(change))
-
-
-def test_harmonics_of_the_table_are_no_fault() -> None:
-    def change(values: Float2D) -> None:
-        theta, level, f = steady(PLAN)
-        extra = np.where(np.isfinite(f), 0.5 * level * np.sin(3 * theta), 0.0)
-        values[[ACC, MASS_ACC]] += extra
-        values[[TABLE, MASS]] -= extra / (6 * np.pi * f) ** 2
-
-    assert "level" not in kinds(list_findings(change))
-
-
-def response(lag_s: float) -> FrequencyResponse:
-    at = (1.0, 3.0, 9.0)
-    return FrequencyResponse(0, at, (1.0, 1.0, 1.0), tuple(-2 * np.pi * f * lag_s for f in at))
-
-
-def test_a_table_that_lags_more_than_it_did_is_soft() -> None:
-    assert list_findings(lag=30, known=response(0.015)) == ()
-    finding = first(list_findings(lag=50, known=response(0.015)), "response")
-    assert finding.stop
-    assert finding.value == pytest.approx(0.025, abs=5e-4)
-    assert "25.0 ms behind its command, 15.0 ms before" in finding.text
-
-
-def test_without_a_loop_check_the_same_frequency_must_be_met_as_before() -> None:
-    both = profile(directions=("forward", "backward"), start_hz=2.0, stop_hz=2.5)
-    drive = plan_sweep(both)
-    half = drive.planned_end // 2
-
-    def change(values: Float2D) -> None:
-        late = simulate_channels(drive, 1.0, 40)
-        values[1:, half:] = late[1:, half:]
-
-    assert list_findings(test=both, drive=drive, lag=20) == ()
-    assert "response" in kinds(list_findings(change, both, drive, lag=20))
-
-
-@pytest.mark.parametrize(("row", "size"), [(TABLE, 3e-4), (ACC, 0.1), (MASS_ACC, 0.15), (R1, 8.0)])
-def test_what_drifts_is_told(row: int, size: float) -> None:
-    finding = next(
-        finding
-        for finding in list_findings(add(row, FAULT_SAMPLE, size))
-        if finding.kind != "level"
-    )
-    assert finding.kind in ("drift", "consistency")
-    assert finding.channel == NAMES[row]
-    assert finding.index - FAULT_SAMPLE < 2.6 * CYCLE_SAMPLES
-    assert list_findings(add(row, FAULT_SAMPLE, size / 10)) == ()
-
-
-def test_a_mass_that_swings_about_another_place_is_told_after_ten_cycles() -> None:
-    long = profile(cycles=40)
-    drive = plan_sweep(long)
-    finding = first(list_findings(add(MASS, FAULT_SAMPLE, 2e-3), long, drive), "drift")
-    assert finding.channel == "mass_disp_m"
-    # The mean is one of twenty checks, two a cycle, each of the last cycle: ten and a half cycles
-    # from the start of the step, and as many checks as a finding takes to be confirmed.
-    cycles = (finding.index - drive.sine_segments[1].start) / CYCLE_SAMPLES
-    assert 10.5 <= cycles <= 12.0
-
-
-@pytest.mark.parametrize("row", [TABLE, ACC, MASS, MASS_ACC])
-@pytest.mark.parametrize("factor", [0.9, 1.1, -1.0])
-def test_a_sensor_that_no_longer_fits_its_partner_is_told(row: int, factor: float) -> None:
-    findings = [
-        finding
-        for finding in list_findings(scale_rows(row, FAULT_SAMPLE, factor))
-        if finding.kind == "consistency"
-    ]
-    assert findings[0].channel == NAMES[row]
-    assert findings[0].index - FAULT_SAMPLE < 2.6 * CYCLE_SAMPLES
-    assert list_findings(scale_rows(row, FAULT_SAMPLE, 1.03)) == ()
-
-
-@pytest.mark.parametrize("row", [MASS, MASS_ACC])
-def test_nor_one_that_never_did(row: int) -> None:
-    assert "consistency" in kinds(list_findings(scale_rows(row, 0, 1.15)))
-    assert list_findings(scale_rows(row, 0, 1.10)) == ()
-
-
-def test_a_sensor_that_the_controller_does_not_need_warns_if_so_asked() -> None:
-    warned = list_findings(scale_rows(MASS_ACC, FAULT_SAMPLE, -1.0), profile("warn"))
-    assert kinds(warned, stop=True) == []
-    assert first(warned, "consistency").to_event().kind == "sensor"
-    assert (
-        kinds(list_findings(scale_rows(ACC, FAULT_SAMPLE, -1.0), profile("warn")), stop=True) != []
-    )
-
-
-# Load cells
-
-
-def impacts(share: float, change: Change | None = None) -> tuple[Finding, ...]:
-    """The cells of the right side bear the mass part of each cycle, the first `share` of it."""
-
-    def push(values: Float2D) -> None:
-        theta, level, f = steady(PLAN)
-        u = np.where(np.isfinite(f), 3e-3 * level / A * np.sin(theta), 0.0)
+    def press(values: Any) -> None:
+        labels, _, phase, level, _ = evaluate_drive(PLAN)
+        held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
+        frequency_hz = np.where(held, np.abs(np.gradient(phase)) * RATE_HZ, 0.0)
+        u = np.where(held, 3e-3 * level / LEVEL_M_S2 * np.sin(2 * np.pi * phase), 0.0)
         force = np.maximum(u - 2e-3, 0.0) * 500e3
         values[R1] += share * force
         values[R2] += (1 - share) * force
         values[MASS] += u
-        values[MASS_ACC] -= (2 * np.pi * np.where(np.isfinite(f), f, 0.0)) ** 2 * u
+        values[MASS_ACC] -= (2 * np.pi * frequency_hz) ** 2 * u
         if change is not None:
             change(values)
 
-    return list_findings(push)
+    return press
 
 
-@pytest.mark.parametrize("share", [0.5, 0.35, 0.6])
-def test_cells_may_share_a_force_as_they_like_but_always_so(share: float) -> None:
-    assert impacts(share) == ()
-    for row, factor in ((R1, 1.3), (R2, 0.7), (R1, -1.0), (R2, 0.1)):
-        finding = first(impacts(share, scale_rows(row, FAULT_SAMPLE, factor)), "share")
-        assert finding.index - FAULT_SAMPLE < 3.1 * CYCLE_SAMPLES, (row, factor)
+def add_harmonic(values: Any) -> None:
+    """Let the table add half the level at three times the frequency of each step."""
+    labels, _, phase, level, _ = evaluate_drive(PLAN)
+    held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
+    omega = 6 * np.pi * np.where(held, np.abs(np.gradient(phase)) * RATE_HZ, np.inf)
+    extra = np.where(held, 0.5 * level * np.sin(6 * np.pi * phase), 0.0)
+    values[[ACC, MASS_ACC]] += extra
+    values[[TABLE, MASS]] -= extra / omega**2
 
 
-def test_a_cell_that_never_bore_a_thing_beside_one_that_does_is_told() -> None:
-    finding = first(impacts(1.0), "share")
-    assert finding.channel == "force_r2_n"
+def change_blends(values: Any) -> None:
+    blend = PLAN.labels(0, values.shape[1])[1] == Label.BLEND
+    values[np.ix_([TABLE, ACC, MASS, MASS_ACC], blend)] *= 1.13
 
 
-def test_where_both_cells_bear_beyond_the_gap_the_gap_is_elsewhere() -> None:
-    finding = first(impacts(0.5, add(MASS, FAULT_SAMPLE, -4e-3)), "drift")
-    assert finding.channel == "mass_disp_m"
-    assert "other side of the gap" in finding.text
+def disturb_command_about_repetition(values: Any) -> None:
+    """Seven samples of a wrong command before a repetition, and five after it."""
+    values[DRIVE, FAULT_SAMPLE : FAULT_SAMPLE + 40] += 5e-3
+    for first in range(FAULT_SAMPLE + 3, FAULT_SAMPLE + 24, 3):
+        values[:, first : first + 3] = values[:, FAULT_SAMPLE : FAULT_SAMPLE + 3]
+    values[DRIVE, FAULT_SAMPLE + 29 :] = simulate_channels()[DRIVE, FAULT_SAMPLE + 29 :]
 
 
-# The loop check judges the sensors itself
+def make_response(lag_s: float) -> FrequencyResponse:
+    frequencies_hz = (1.0, 3.0, 9.0)
+    phases = tuple(-2 * np.pi * f * lag_s for f in frequencies_hz)
+    return FrequencyResponse(0, frequencies_hz, (1.0, 1.0, 1.0), phases)
 
 
-def checking() -> Drive:
-    """A held motion at a tenth of the level, as in a loop check."""
-    course = start_trajectory(TEST).append_blend(SineTarget(2.0, 0.1 * A), -1, 1.5, Label.BLEND)
+WARN = {"test": make_test("warn")}
+SMALL_TEST = make_test(acceleration_g=0.002)
+SMALL = {"test": SMALL_TEST, "drive": plan_sweep(SMALL_TEST)}
+LONG_TEST = make_test(cycles=40)
+LONG = {"test": LONG_TEST, "drive": plan_sweep(LONG_TEST)}
+UP_DOWN_TEST = make_test(directions=("forward", "backward"))
+UP_DOWN = {"test": UP_DOWN_TEST, "drive": plan_sweep(UP_DOWN_TEST)}
+SILENT = {"scale": 0.0}
+
+
+def soften_on_the_way_back(values: Any) -> None:
+    half = UP_DOWN["drive"].planned_end // 2
+    values[1:, half:] = simulate_channels(UP_DOWN["drive"], 1.0, 40)[1:, half:]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A change and its first finding: kind, channel, whether it stops, latest sample from there.
+
+    `is_only`: there is no other finding at all. `among`: other kinds may come before it.
+    """
+
+    name: str
+    change: Change | None
+    kind: str
+    row: int | None
+    stops: bool
+    latest: int
+    earliest: int = 0
+    is_only: bool = False
+    value: float | None = None
+    options: dict[str, Any] | None = None
+
+
+def list_limit_and_sensor_faults() -> Iterator[Fault]:
+    """Faults that single samples show."""
+    table_alone = 30e3 / 2000.0 - 550.0 / 2000.0 * LEVEL_M_S2
+    mass_alone = (30e3 + 2000.0 * 2 * LEVEL_M_S2) / 550.0
+    no_mass = put(MASS_ACC, np.nan)
+    whole = simulate_channels(PLAN, 0.0)
+    # fmt: off
+    for sign, side in ((1.0, "right"), (-1.0, "left")):
+        yield Fault(f"stroke {side}", put(TABLE, sign * 0.0602), "stroke", TABLE, True, 2, 1)
+        yield Fault(f"acceleration {side}", put(ACC, sign * 1.02 * GRAVITY_M_S2), "acceleration",
+                    ACC, True, 2, 1)
+        yield Fault(f"force {side}", put(MASS_ACC, sign * mass_alone), "force", ACC, True, 2, 1)
+    yield Fault("force of the table", put(ACC, table_alone + 0.2), "force", ACC, True, 600)
+    yield Fault("force without the mass", combine(no_mass, put(ACC, 15.1)), "force", ACC, True, 5)
+    yield Fault("velocity", ramp_table(0.55), "velocity", TABLE, True, 22, 1)
+    yield Fault("stroke behind a lost sample", combine(put(TABLE, np.nan, 1),
+                put(TABLE, 0.07, first=FAULT_SAMPLE + 1)), "stroke", TABLE, True, 4)
+    yield Fault("at its range", None, "rail", MASS, True, 2, 2, True,
+                options={"at_range": put(MASS, True, 3)})
+    yield Fault("at its range, to warn of", None, "rail", MASS, False, 2, 2, True,
+                options={"at_range": put(MASS, True, 3), **WARN})
+    yield Fault("lost sample", put(TABLE, np.nan, 1), "lost", TABLE, False, 0, 0, True)
+    yield Fault("lost 20 ms", put(TABLE, np.nan, 41), "lost", TABLE, True, 40, 40)
+    yield Fault("loose contact", lose_every(3), "lost", TABLE, True, 400)
+    yield Fault("lost block", put(EVERYTHING, np.nan, 20), "lost", None, False, 0, 0, True)
+    for row in (TABLE, ACC, MASS, MASS_ACC, R1):
+        name = NAMES[row]
+        yield Fault(f"stuck {name}", put(row, 1e-4), "stuck", row, True, 19, 19)
+        yield Fault(f"cable off {name}", put(row, make_noise(row, 0.1), 4000), "silent", row, True,
+                    300)
+    for jump in (15.0, 150.0, 6000.0):
+        yield Fault(f"cable off after {jump} sigma", lose_noise(MASS_ACC, jump), "silent", MASS_ACC,
+                    True, 400)
+    for row in (DRIVE, TABLE, ACC):
+        yield Fault(f"stuck without noise {NAMES[row]}", put(row, whole[row, FAULT_SAMPLE]),
+                    "stuck", row, True, 2000, options=SILENT)
+    for row in (DRIVE, TABLE, ACC, MASS, MASS_ACC, R1, L2):
+        limit = 1.7 * find_spike_limit(row)
+        yield Fault(f"spike {NAMES[row]}", add(row, limit, 1), "spike", row, False, 0, 0, True)
+    for size in (0.0602, -0.2, 5.0):
+        yield Fault(f"spike of {size} m", add(TABLE, size, 1), "spike", TABLE, False, 0, 0, True,
+                    abs(size))
+    for back in (7, 20, 333):
+        yield Fault(f"repeated after {back}", repeat(back, 15), "repeated", None, False, 4, 4, True,
+                    back / RATE_HZ)
+    yield Fault("repeated for 30 ms", repeat(20, 60), "lost", None, True, 50)
+    # fmt: on
+
+
+def list_motion_faults() -> Iterator[Fault]:
+    """Faults that the motion shows, some over several cycles."""
+    soft = {"lag": 50, "known": make_response(0.015)}
+    quarter = CYCLE_SAMPLES // 4
+    checks = round(2.6 * CYCLE_SAMPLES)
+    # fmt: off
+    yield Fault("late command", delay_command, "command", DRIVE, True, quarter)
+    yield Fault("gain of a small command", multiply(DRIVE, 1.05), "command", DRIVE, True, 4000,
+                options=SMALL)
+    yield Fault("table stays", stop_table, "following", TABLE, True, quarter)
+    yield Fault("lag of 160 ms", None, "following", TABLE, True, 0, -9999, options={"lag": 320})
+    for factor in (1.12, 0.88):
+        rows = [TABLE, ACC, MASS, MASS_ACC]
+        yield Fault(f"level {factor}", multiply(rows, factor, 0), "level", ACC, False, 9999, -9999,
+                    value=factor * LEVEL_M_S2)
+    for factor in (2.1, 0.48):
+        rows = [TABLE, ACC, MASS, MASS_ACC]
+        held = HELD_FROM - FAULT_SAMPLE + 2 * CYCLE_SAMPLES
+        yield Fault(f"level {factor}", multiply(rows, factor, 0), "level", ACC, True, held + 200,
+                    held)
+    yield Fault("softer than identified", None, "response", TABLE, True, 9999, -9999, value=0.025,
+                options=soft)
+    yield Fault("softer on the way back", soften_on_the_way_back, "response", TABLE, True, 99999,
+                options={"lag": 20, **UP_DOWN})
+    for row, size in ((ACC, 0.1), (MASS_ACC, 0.15), (R1, 8.0)):
+        yield Fault(f"offset {NAMES[row]}", add(row, size), "drift", row, True, checks)
+    yield Fault("mean of the mass", add(MASS, 2e-3), "drift", MASS, True,
+                HELD_FROM + 12 * CYCLE_SAMPLES - FAULT_SAMPLE,
+                HELD_FROM + round(10.5 * CYCLE_SAMPLES) - FAULT_SAMPLE, options=LONG)
+    for row in (TABLE, ACC, MASS, MASS_ACC):
+        for factor in (0.9, 1.1, -1.0):
+            yield Fault(f"{NAMES[row]} times {factor}", multiply(row, factor), "consistency", row,
+                        True, checks)
+    for row in (MASS, MASS_ACC):
+        yield Fault(f"{NAMES[row]} wrong from the start", multiply(row, 1.15, 0), "consistency",
+                    None, True, 9999, -9999)
+    yield Fault("sensor to warn of", multiply(MASS_ACC, -1.0), "consistency", MASS_ACC, False,
+                checks, options=WARN)
+    yield Fault("sensor of the controller", multiply(ACC, -1.0), "consistency", ACC, True, checks,
+                options=WARN)
+    for share in (0.5, 0.35, 0.6):
+        for row, factor in ((R1, 1.3), (R2, 0.7), (R1, -1.0), (R2, 0.1)):
+            yield Fault(f"{NAMES[row]} times {factor}, share {share}",
+                        press_bumper(share, multiply(row, factor)), "share", None, True, 3100)
+    yield Fault("cell without its share", press_bumper(1.0), "share", R2, True, 9999, -9999)
+    yield Fault("gap elsewhere", press_bumper(0.5, add(MASS, -4e-3)), "drift", MASS, True, 9999)
+    # fmt: on
+
+
+FAULTS = [*list_limit_and_sensor_faults(), *list_motion_faults()]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
+def test_fault_is_found_in_time(fault: Fault) -> None:
+    findings = list_findings(fault.change, **fault.options or {})
+    same = [
+        finding
+        for finding in findings
+        if (finding.kind, finding.stop) == (fault.kind, fault.stops)
+        and (fault.row is None or finding.channel == NAMES[fault.row])
+    ]
+    assert same, [(finding.kind, finding.channel, finding.stop) for finding in findings]
+    finding = same[0]
+    assert fault.earliest <= finding.index - FAULT_SAMPLE <= fault.latest
+    if fault.is_only:
+        assert len(findings) == 1
+    if not fault.stops:
+        assert not [other for other in findings if other.stop]
+        assert finding.to_event().kind == ("alarm" if fault.kind == "level" else "sensor")
+    if fault.kind in ("stroke", "acceleration", "force") and " " in fault.name:
+        assert np.sign(finding.value) == (-1.0 if fault.name.endswith("left") else 1.0)
+        assert abs(finding.value) > finding.limit
+    if fault.value is not None:
+        assert finding.value == pytest.approx(fault.value, rel=0.02)
+
+
+@dataclass(frozen=True)
+class Sound:
+    """A change that is no fault: without any finding, or without one of a kind."""
+
+    name: str
+    change: Change | None
+    kind: str = ""
+    options: dict[str, Any] | None = None
+
+
+def list_sound_runs() -> Iterator[Sound]:
+    # fmt: off
+    for scale in (0.0, 0.2, 1.0, 3.0):
+        yield Sound(f"noise times {scale}", None, options={"scale": scale, "lag": 30})
+    for gap_mm in (-10.0, 0.0, float("inf")):
+        yield Sound(f"gap {gap_mm}", None, options={"test": make_test(gap_mm=gap_mm)})
+    yield Sound("within the stroke", put(TABLE, 0.0598), "stroke")
+    yield Sound("slow enough", ramp_table(0.45), "velocity")
+    yield Sound("mass not measured", put(MASS_ACC, np.nan), "force")
+    yield Sound("two samples at the range", None, options={"at_range": put(MASS, True, 2)})
+    yield Sound("15 samples alike", put(MASS, 1e-4, 15), "stuck")
+    yield Sound("at rest without noise", put(TABLE, 0.0, 1000, 0), options=SILENT)
+    yield Sound("force that never comes, without noise", put(R1, 0.0, first=0), options=SILENT)
+    yield Sound("spike in two channels", add([R1, R2], 100.0, 1))
+    yield Sound("command a sample late", lambda values: np.copyto(
+        values[DRIVE], 1.005 * np.roll(values[DRIVE], 1)))
+    yield Sound("small command 1 % off", multiply(DRIVE, 1.01), "command", SMALL)
+    yield Sound("command wrong about a repetition", disturb_command_about_repetition, "command")
+    yield Sound("lag of 90 ms", None, options={"lag": 180})
+    yield Sound("lag as identified", None, options={"lag": 30, "known": make_response(0.015)})
+    yield Sound("lag both ways", None, options={"lag": 20, **UP_DOWN})
+    for factor in (1.08, 0.92):
+        yield Sound(f"level {factor}", multiply([TABLE, ACC, MASS, MASS_ACC], factor, 0), "level")
+    yield Sound("level in blends", change_blends, "level")
+    yield Sound("harmonic of the table", add_harmonic, "level")
+    for row in (TABLE, ACC, MASS, MASS_ACC, R1, L2):
+        silent, spike = make_noise(row, 0.6), 0.4 * find_spike_limit(row)
+        yield Sound(f"less noise {NAMES[row]}", put(row, silent, 4000), "silent")
+        yield Sound(f"small spike {NAMES[row]}", add(row, spike, 1))
+    for row, size in ((TABLE, 3e-5), (ACC, 0.01), (MASS_ACC, 0.015), (R1, 0.8)):
+        yield Sound(f"small offset {NAMES[row]}", add(row, size))
+    for row in (TABLE, ACC, MASS, MASS_ACC):
+        yield Sound(f"{NAMES[row]} times 1.03", multiply(row, 1.03))
+    for row in (MASS, MASS_ACC):
+        yield Sound(f"{NAMES[row]} times 1.1 from the start", multiply(row, 1.1, 0))
+    for share in (0.5, 0.35, 0.6):
+        yield Sound(f"cells share {share}", press_bumper(share))
+    # fmt: on
+
+
+@pytest.mark.parametrize("run", [*list_sound_runs()], ids=lambda run: run.name)
+def test_sound_run_has_no_finding(run: Sound) -> None:
+    findings = list_findings(run.change, **run.options or {})
+    assert [finding for finding in findings if finding.kind == run.kind or not run.kind] == []
+
+
+@pytest.mark.parametrize(
+    ("change", "test"),
+    [
+        (put(TABLE, np.nan, 40), TEST),
+        (put(MASS, np.nan, 41), WARN["test"]),
+        (lose_every(20), TEST),
+    ],
+)
+def test_loss_that_does_not_stop(change: Change, test: Profile) -> None:
+    findings = list_findings(change, test)
+    assert {(finding.kind, finding.stop) for finding in findings} == {("lost", False)}
+
+
+def test_offset_of_the_table_is_found() -> None:
+    findings = list_findings(add(TABLE, 3e-4))
+    finding = next(finding for finding in findings if finding.kind != "level")
+    assert finding.kind in ("drift", "consistency")
+    assert finding.channel == "table_disp_m"
+    assert finding.index - FAULT_SAMPLE < 2.6 * CYCLE_SAMPLES
+
+
+@pytest.mark.parametrize("noisy", [(ACC,), (TABLE,), (TABLE, ACC), (TABLE, ACC, MASS, MASS_ACC)])
+def test_repetition_is_proved_by_two_sensors_with_noise(noisy: tuple[int, ...]) -> None:
+    findings = list_findings(repeat(50, 40), noisy=noisy)
+    is_repeated = "repeated" in {finding.kind for finding in findings}
+    assert is_repeated == (len(noisy) > 1)
+
+
+def make_check_drive() -> Drive:
+    """Return a held motion at a tenth of the level, as in a loop check."""
+    target = SineTarget(2.0, 0.1 * LEVEL_M_S2)
+    course = start_trajectory(TEST).append_blend(target, -1, 1.5, Label.BLEND)
     return course.append_hold(6000, -1, Label.CHECK).to_drive(TEST.sweep.steps)
 
 
 @pytest.mark.parametrize("row", [DRIVE, TABLE, ACC, MASS, MASS_ACC])
 @pytest.mark.parametrize("factor", [-1.0, 0.3, 2.0])
-def test_a_loop_check_comes_to_speak_of_wrong_sensors(row: int, factor: float) -> None:
-    assert list_findings(scale_rows(row, 0, factor), drive=checking()) == ()
+def test_wrong_sensors_are_left_to_the_loop_check(row: int, factor: float) -> None:
+    assert list_findings(multiply(row, factor, 0), drive=make_check_drive()) == []
 
 
-def test_but_limits_and_broken_sensors_stop_it() -> None:
-    assert "stroke" in kinds(
-        list_findings(put(TABLE, FAULT_SAMPLE, 0.07), drive=checking()), stop=True
-    )
-    assert "stuck" in kinds(
-        list_findings(put(TABLE, FAULT_SAMPLE, 1e-4), drive=checking()), stop=True
-    )
-    assert "following" in kinds(
-        list_findings(add(TABLE, FAULT_SAMPLE, 2e-3), drive=checking()), stop=True
-    )
+@pytest.mark.parametrize(
+    ("kind", "change"),
+    [("stroke", put(TABLE, 0.07)), ("stuck", put(TABLE, 1e-4)), ("following", add(TABLE, 2e-3))],
+)
+def test_limits_and_broken_sensors_stop_a_loop_check(kind: str, change: Change) -> None:
+    findings = list_findings(change, drive=make_check_drive())
+    assert kind in {finding.kind for finding in findings if finding.stop}
 
 
-# The guard as a value
+MANY_FAULTS = combine(
+    put(R1, np.random.default_rng(2).standard_normal(6000) * 0.1, 6000, 3500),
+    add(TABLE, 0.02, 1, 4001),
+    put(EVERYTHING, np.nan, 20, 4500),
+    multiply(MASS_ACC, 1.4, 5100),
+    repeat(20, 15),
+    put(MASS, 0.01, 300, 7007),
+    multiply(ACC, 0.4, 8000),
+    put(TABLE, 0.061, first=11000),
+)
 
 
-def everything(values: Float2D) -> None:
-    """Many faults, one after another."""
-    put(R1, 3500, np.random.default_rng(2).standard_normal(6000) * 0.1, 6000)(values)
-    add(TABLE, 4001, 0.02, 1)(values)
-    put(slice(None), 4500, np.nan, 20)(values)
-    scale_rows(MASS_ACC, 5100, 1.4)(values)
-    for k in range(6003, 6018):
-        values[:, k] = values[:, k - 20]
-    put(MASS, 7007, 0.01, 300)(values)
-    scale_rows(ACC, 8000, 0.4)(values)
-    put(TABLE, 11000, 0.061)(values)
-
-
-def test_the_cut_into_blocks_changes_no_finding() -> None:
-    warn = profile("warn")
-    whole = list_findings(everything, warn, cut=20, last=11100)
-    assert {finding.kind for finding in whole} >= {
-        "silent", "spike", "lost", "consistency", "repeated", "stuck", "level", "stroke",
-    }  # fmt: skip
+def test_division_into_blocks_changes_no_finding() -> None:
+    whole = list_findings(MANY_FAULTS, cut=20, last=11100, **WARN)
+    kinds = {"silent", "spike", "lost", "consistency", "repeated", "stuck", "level", "stroke"}
+    assert {finding.kind for finding in whole} >= kinds
     for cut in (1, 7, 64, 500):
-        assert repr(list_findings(everything, warn, cut=cut, last=11100)) == repr(whole), cut
+        assert repr(list_findings(MANY_FAULTS, cut=cut, last=11100, **WARN)) == repr(whole), cut
 
 
-def test_a_guard_is_a_value() -> None:
-    values = simulate_channels(PLAN)
-    everything(values)
+def test_state_of_protection_is_a_value() -> None:
+    values = simulate_channels()
+    MANY_FAULTS(values)
     clipped = np.zeros(values.shape, dtype=np.bool_)
-    guard = start_protection(TEST, RIG, noises())
-    guards: list[ProtectionState] = []
-    for at in range(0, 9000, 500):
-        guards.append(guard)
-        guard, _ = inspect_samples(guard, make_observation(values, clipped, PLAN, at, 500))
-    for at, earlier in zip(range(0, 9000, 500), guards, strict=True):
-        again = make_observation(values, clipped, PLAN, at, 500)
-        assert repr(inspect_samples(earlier, again)[1]) == repr(inspect_samples(earlier, again)[1])
+    guard = start_protection(TEST, RIG, NOISE_SI)
+    states: list[tuple[ProtectionState, Observation]] = []
+    for first in range(0, 9000, 500):
+        states.append((guard, observe(values, clipped, PLAN, first, 500)))
+        guard, _ = inspect_samples(*states[-1])
+    for state in states:
+        assert repr(inspect_samples(*state)[1]) == repr(inspect_samples(*state)[1])
 
 
-def test_samples_that_were_left_out_are_refused() -> None:
-    values, clipped = simulate_channels(PLAN), np.zeros((9, 20000), dtype=np.bool_)
-    guard, _ = inspect_samples(
-        start_protection(TEST, RIG, noises()), make_observation(values, clipped, PLAN, 0, 20)
-    )
+def test_omitted_samples_are_refused() -> None:
+    values = simulate_channels()
+    clipped = np.zeros(values.shape, dtype=np.bool_)
+    guard = start_protection(TEST, RIG, NOISE_SI)
+    guard, _ = inspect_samples(guard, observe(values, clipped, PLAN, 0, 20))
     with pytest.raises(ValueError, match=r"\b20\b.*\b40\b"):
-        inspect_samples(guard, make_observation(values, clipped, PLAN, 40, 20))
+        inspect_samples(guard, observe(values, clipped, PLAN, 40, 20))
 
 
-def test_a_finding_is_told_once_until_it_has_been_away_for_a_second() -> None:
-    def twice(apart: int) -> Change:
-        def change(values: Float2D) -> None:
-            for at in (FAULT_SAMPLE, FAULT_SAMPLE + apart):
-                values[MASS, at] += 0.05
-
-        return change
-
-    assert kinds(list_findings(twice(1500))) == ["spike"]
-    assert kinds(list_findings(twice(2500))) == ["spike", "spike"]
-
-
-def test_a_finding_becomes_a_trip_or_an_event() -> None:
+def test_finding_becomes_a_trip_or_an_event() -> None:
     finding = Finding(12, "stroke", "table_disp_m", 0.07, 0.06, "too far", True)
     assert finding.to_trip(20) == Trip(12, 20, "stroke", "table_disp_m", 0.07, 0.06, "too far")
     assert finding.to_event() == Event(12, "sensor", "too far")
     assert replace(finding, kind="level").to_event().kind == "alarm"
 
 
-def test_sentences_name_channel_sample_value_and_limit() -> None:
-    text = first(list_findings(put(TABLE, FAULT_SAMPLE, 0.0612)), "stroke").text
-    assert text.startswith("table_disp_m: 61.2 mm at sample 500")
-    assert text.endswith("exceeds 60 mm")
+@pytest.mark.parametrize(
+    ("kind", "change", "options", "parts"),
+    [
+        ("stroke", put(TABLE, 0.0612), {}, ("table_disp_m: 61.2 mm at sample 500", "60 mm")),
+        ("lost", put(EVERYTHING, np.nan, 20), {}, ("all channels",)),
+        ("response", None, {"lag": 50, "known": make_response(0.015)}, ("25.0 ms", "15.0 ms")),
+        ("drift", press_bumper(0.5, add(MASS, -4e-3)), {}, ("other side of the gap",)),
+    ],
+)
+def test_finding_states_channel_value_and_limit(
+    kind: str, change: Change | None, options: dict[str, Any], parts: tuple[str, ...]
+) -> None:
+    findings = list_findings(change, **options)
+    text = next(finding.text for finding in findings if finding.kind == kind)
+    assert all(part in text for part in parts), text

@@ -49,14 +49,14 @@ from table_io.safety.protection.thresholds import (
     make_sample_state,
 )
 from table_io.units import GRAVITY_M_S2
-from tests.builders.rigs import RIG
-from tests.table_io.safety.test_protection_laws import make_profile
+from tests.builders.profiles import make_profile
+from tests.builders.rigs import NOISE_SI, RIG
 
 CHANNEL_COUNT = len(RIG.channels)
 REST_SAMPLES = 200
+PROFILE = make_profile()
 LAW = settings(max_examples=30, derandomize=True)
-NOISE = {sensor.channel: (sensor.noise_rms * sensor.si_per_unit, 2) for sensor in RIG.sensors}
-THRESHOLDS = compute_thresholds(make_profile(2000.0), RIG, NOISE)._replace(
+THRESHOLDS = compute_thresholds(PROFILE, RIG, NOISE_SI)._replace(
     has_noise=np.ones(CHANNEL_COUNT, dtype=np.bool_)
 )
 
@@ -87,12 +87,12 @@ def count_silent(share: float, row: int, thresholds: Thresholds = THRESHOLDS) ->
 
 @given(row=st.integers(0, CHANNEL_COUNT - 1), share=st.floats(0.01, 2.0))
 @LAW
-def test_a_channel_is_silent_below_a_third_of_its_noise(row: int, share: float) -> None:
+def test_check_silence_below_a_third_of_the_noise(row: int, share: float) -> None:
     if abs(share - 1.0 / 3.0) > 0.01:
         assert (count_silent(share, row) > 0) == (share < 1.0 / 3.0)
 
 
-def test_silence_needs_noise_and_enough_rest() -> None:
+def test_check_silence_without_noise_or_rest() -> None:
     none = THRESHOLDS._replace(has_noise=np.zeros(CHANNEL_COUNT, dtype=np.bool_))
     assert count_silent(0.01, 0, none) == 0
     assert count_silent(0.01, 0, THRESHOLDS._replace(min_rest_samples=REST_SAMPLES - 1.0)) == 0
@@ -106,13 +106,11 @@ def make_scalars(lag_s: float, gain: float = 1.0) -> Any:
 
 
 @given(
-    accelerations=st.lists(
-        st.floats(-9.0, 9.0) | st.just(math.nan), min_size=1, max_size=8
-    ),
+    accelerations=st.lists(st.floats(-9.0, 9.0) | st.just(math.nan), min_size=1, max_size=8),
     lag_s=st.floats(0.0, 0.05),
-)  # fmt: skip
+)
 @LAW
-def test_the_payload_deflects_the_table_by_the_peak_of_its_acceleration(
+def test_payload_deflection_follows_the_peak_acceleration(
     accelerations: list[float], lag_s: float
 ) -> None:
     scalars, peak = make_scalars(lag_s), 0.0
@@ -122,24 +120,22 @@ def test_the_payload_deflects_the_table_by_the_peak_of_its_acceleration(
         if not math.isnan(acceleration):
             peak = max(abs(acceleration), peak * (1.0 - 1.0 / THRESHOLDS.episode_samples))
         assert scalars[PAYLOAD_PEAK] == pytest.approx(peak)
+        without = THRESHOLDS._replace(mass_row=-1)
+        unknown = make_scalars(UNKNOWN_LAG)
+        assert sample_checks._payload_deflection(values, 2, without, make_scalars(0.01)) == 0.0
+        assert sample_checks._payload_deflection(values, 2, THRESHOLDS, unknown) == 0.0
         ratio = THRESHOLDS.mass_kg / THRESHOLDS.table_kg
         assert deflection == pytest.approx(ratio * peak * (0.5 * lag_s) ** 2)
 
 
-def test_without_an_accelerometer_or_a_lag_no_deflection_is_allowed_for() -> None:
-    values = np.full((CHANNEL_COUNT, 3), 5.0)
-    without = THRESHOLDS._replace(mass_row=-1)
-    assert sample_checks._payload_deflection(values, 2, without, make_scalars(0.01)) == 0.0
-    unknown = make_scalars(UNKNOWN_LAG)
-    assert sample_checks._payload_deflection(values, 2, THRESHOLDS, unknown) == 0.0
-
-
 @given(
-    seed=st.integers(0, 99), lag_s=st.floats(0.0, 0.12), gain=st.floats(0.8, 1.2),
+    seed=st.integers(0, 99),
+    lag_s=st.floats(0.0, 0.12),
+    gain=st.floats(0.8, 1.2),
     displacement=st.floats(-0.01, 0.01),
-)  # fmt: skip
+)
 @LAW
-def test_the_following_error_is_measured_from_the_delayed_command(
+def test_following_error_from_the_delayed_command(
     seed: int, lag_s: float, gain: float, displacement: float
 ) -> None:
     command = 0.01 * np.random.default_rng(seed).standard_normal(600)
@@ -157,16 +153,6 @@ def test_the_following_error_is_measured_from_the_delayed_command(
     ) == pytest.approx(beyond_m)
 
 
-@given(a=st.floats(-9, 9), b=st.floats(-9, 9), c=st.floats(-9, 9), lost=st.integers(0, 5))
-@LAW
-def test_limits_see_the_median_of_three_samples(a: float, b: float, c: float, lost: int) -> None:
-    row = np.array([9e9, a, b, c, -9e9])
-    assert sample_checks._median(row, 3) == np.median([a, b, c])
-    if 1 <= lost <= 3:
-        row[lost] = math.nan
-        assert math.isnan(sample_checks._median(row, 3))
-
-
 DRIVE, TABLE, ACC, MASS, MASS_ACC = range(5)
 SIGNS = st.sampled_from([-1.0, 1.0])
 # Just inside and just beyond a limit.
@@ -180,9 +166,7 @@ def list_reports(findings: Any, count: int) -> list[Report]:
 
 @given(gap=st.integers(0, 4000), code=st.integers(0, 12), row=st.integers(0, CHANNEL_COUNT - 1))
 @LAW
-def test_a_finding_is_repeated_when_it_was_absent_for_a_second(
-    gap: int, code: int, row: int
-) -> None:
+def test_report_repeats_after_a_second(gap: int, code: int, row: int) -> None:
     state, findings = make_sample_state(CHANNEL_COUNT), np.full((3, 5), math.nan)
 
     def report(count: int, index: int, code: int, room: int = 3) -> int:
@@ -198,11 +182,14 @@ def test_a_finding_is_repeated_when_it_was_absent_for_a_second(
 
 
 @given(
-    seed=st.integers(0, 99), sign=SIGNS, share=SHARES,
-    code=st.sampled_from([STROKE, VELOCITY, ACCELERATION, FORCE]), is_lost=st.booleans(),
-)  # fmt: skip
+    seed=st.integers(0, 99),
+    sign=SIGNS,
+    share=SHARES,
+    code=st.sampled_from([STROKE, VELOCITY, ACCELERATION, FORCE]),
+    is_lost=st.booleans(),
+)
 @LAW
-def test_each_limit_of_the_table_is_that_of_its_definition(
+def test_check_limits_at_each_limit(
     seed: int, sign: float, share: float, code: int, is_lost: bool
 ) -> None:
     """Stroke, difference quotient over 10 ms, acceleration, and force of table and mass."""
@@ -237,15 +224,26 @@ def test_each_limit_of_the_table_is_that_of_its_definition(
 
 
 @given(
-    sign=SIGNS, share=SHARES, slope=st.floats(-1e-4, 1e-4), peak=st.floats(0.0, 0.05),
-    stage=st.sampled_from([0.0, 0.5, SWEEP_STAGE]), lag_s=st.just(UNKNOWN_LAG) | st.floats(0, 0.09),
-    gain=st.floats(0.8, 1.2), a=st.floats(-9.0, 9.0),
-)  # fmt: skip
+    sign=SIGNS,
+    share=SHARES,
+    slope=st.floats(-1e-4, 1e-4),
+    peak=st.floats(0.0, 0.05),
+    stage=st.sampled_from([0.0, 0.5, SWEEP_STAGE]),
+    lag_s=st.just(UNKNOWN_LAG) | st.floats(0, 0.09),
+    gain=st.floats(0.8, 1.2),
+    a=st.floats(-9.0, 9.0),
+)
 @LAW
-def test_eight_samples_beyond_the_tolerance_are_an_error_of_command_or_table(
-    sign: float, share: float, slope: float, peak: float, stage: float, lag_s: float, gain: float,
+def test_check_following_after_eight_samples(
+    sign: float,
+    share: float,
+    slope: float,
+    peak: float,
+    stage: float,
+    lag_s: float,
+    gain: float,
     a: float,
-) -> None:  # fmt: skip
+) -> None:
     in_check, is_unknown = stage < 1.0, lag_s == UNKNOWN_LAG
     gain = 1.0 if is_unknown else gain
     command = slope * np.arange(600.0)
@@ -291,7 +289,7 @@ def test_eight_samples_beyond_the_tolerance_are_an_error_of_command_or_table(
 
 @given(per_half=st.sampled_from([4, 8, 16, 32]), sign=SIGNS, seed=st.integers(0, 99))
 @LAW
-def test_marks_are_half_cycles_and_new_motions(per_half: int, sign: float, seed: int) -> None:
+def test_find_mark_at_half_cycles_and_new_motions(per_half: int, sign: float, seed: int) -> None:
     """The phase may restart at any cycle; its steps, here exact in binary, add up."""
     chance = np.random.default_rng(seed)
     keys = np.repeat(chance.choice([0.0, -1.0, 1.0, 2.0, 3.0, 0.5], 6), 3 * per_half + 1)
@@ -315,7 +313,7 @@ def test_marks_are_half_cycles_and_new_motions(per_half: int, sign: float, seed:
         assert (scalars[MOTION_KEY], scalars[RUN_STAGE]) == (key, stage)
 
 
-def test_a_slow_or_standing_command_keeps_its_peak_for_a_second_at_most() -> None:
+def test_command_peak_of_a_standing_command_decays() -> None:
     scalars = make_sample_state(CHANNEL_COUNT).scalars
     scalars[COMMAND_PEAK] = 1.0
     for i in range(1, 2001):
@@ -327,11 +325,9 @@ def test_a_slow_or_standing_command_keeps_its_peak_for_a_second_at_most() -> Non
     row=st.integers(0, CHANNEL_COUNT - 1), is_noisy=st.booleans(), percent=st.integers(-100, 100)
 )
 @LAW
-def test_a_channel_is_stuck_after_its_run_or_where_it_must_have_moved(
-    row: int, is_noisy: bool, percent: int
-) -> None:
-    noise = NOISE if is_noisy else dict.fromkeys(RIG.channels, (0.0, 2000))
-    thresholds = compute_thresholds(make_profile(2000.0), RIG, noise)
+def test_check_stuck_after_its_run(row: int, is_noisy: bool, percent: int) -> None:
+    noise = NOISE_SI if is_noisy else dict.fromkeys(RIG.channels, (0.0, 2000))
+    thresholds = compute_thresholds(PROFILE, RIG, noise)
     values = np.random.default_rng(1).standard_normal((CHANNEL_COUNT, 200))
     values[row, 20:] = 0.3
     # The command moves by twenty steps of the coarser converter in `needed` samples.
@@ -348,7 +344,7 @@ def test_a_channel_is_stuck_after_its_run_or_where_it_must_have_moved(
     reports = list_reports(findings, count)
     channel = RIG.channels[row]
     run: float = math.inf
-    if is_noisy and NOISE[channel][0] > 0:
+    if is_noisy and NOISE_SI[channel][0] > 0:
         run = 20.0  # 10 ms, ten times the run of two
     elif row in (DRIVE, TABLE, ACC) and step:
         speed = abs(step) * (2.0 if row == ACC else 1.0)
@@ -362,9 +358,7 @@ def test_a_channel_is_stuck_after_its_run_or_where_it_must_have_moved(
 
 @given(row=st.integers(0, CHANNEL_COUNT - 1), sign=SIGNS, share=SHARES, other=st.booleans())
 @LAW
-def test_a_spike_is_beyond_its_limit_in_exactly_one_channel(
-    row: int, sign: float, share: float, other: bool
-) -> None:
+def test_check_spikes_in_one_channel(row: int, sign: float, share: float, other: bool) -> None:
     values = np.zeros((CHANNEL_COUNT, 9))
     limit = THRESHOLDS.spike_limit[row]
     values[row, 7] = sign * share * limit
@@ -384,7 +378,7 @@ def test_a_spike_is_beyond_its_limit_in_exactly_one_channel(
 
 @given(first=st.integers(30, 490), then=st.integers(30, 490), before=st.integers(0, 8))
 @LAW
-def test_five_samples_at_one_distance_are_a_repetition(first: int, then: int, before: int) -> None:
+def test_is_repeated_after_five_samples(first: int, then: int, before: int) -> None:
     """Samples at another distance before do not count; the first new one ends it."""
     values = np.random.default_rng(2).standard_normal((CHANNEL_COUNT, 560))
     before = 0 if then == first else before
@@ -402,9 +396,7 @@ def test_five_samples_at_one_distance_are_a_repetition(first: int, then: int, be
 
 @pytest.mark.parametrize("row", [0, 3, CHANNEL_COUNT - 1])
 @pytest.mark.parametrize("is_repeated", [False, True])
-def test_a_channel_is_blind_after_twenty_milliseconds_and_recovers_ten_times_as_slowly(
-    row: int, is_repeated: bool
-) -> None:
+def test_check_delivery_balance_of_lost_samples(row: int, is_repeated: bool) -> None:
     values = np.ones((CHANNEL_COUNT, 2000))
     lost = np.zeros(2000, dtype=np.bool_)
     lost[100:141] = lost[150] = True
@@ -431,7 +423,7 @@ def test_a_channel_is_blind_after_twenty_milliseconds_and_recovers_ten_times_as_
     assert [report[:3] for report in singles] == ([] if is_repeated else [(100, LOST, row)])
 
 
-def test_a_block_without_any_channel_is_dropped_and_three_samples_at_the_range_are_a_rail() -> None:
+def test_check_delivery_of_dropped_and_clipped_samples() -> None:
     values = np.ones((CHANNEL_COUNT, 20))
     values[:, 5] = math.nan
     values[:-1, 9] = math.nan
@@ -454,10 +446,12 @@ def test_a_block_without_any_channel_is_dropped_and_three_samples_at_the_range_a
 @pytest.mark.parametrize("rate_hz", [1000.0, 2000.0, 4000.0])
 @given(run=st.integers(1, 500), scale=st.floats(0.0, 30.0))
 @LAW
-def test_thresholds_follow_from_rig_rate_and_noise(rate_hz: float, run: int, scale: float) -> None:
+def test_compute_thresholds_in_closed_form(rate_hz: float, run: int, scale: float) -> None:
     sigma = np.array([scale * sensor.noise_rms * sensor.si_per_unit for sensor in RIG.sensors])
     noise = {name: (rms, run) for name, rms in zip(RIG.channels, sigma, strict=True)}
-    thresholds = compute_thresholds(make_profile(rate_hz), RIG, noise)
+    thresholds = compute_thresholds(
+        make_profile(tables={"acquisition": {"rate_hz": rate_hz}}), RIG, noise
+    )
     ranges = np.array([sensor.range * sensor.si_per_unit for sensor in RIG.sensors])
     dac_m = 0.12 / 2**18
     lsb = 2.0 * ranges / 2**24
@@ -479,47 +473,55 @@ def test_thresholds_follow_from_rig_rate_and_noise(rate_hz: float, run: int, sca
     )
     assert thresholds.following_tolerance_m == pytest.approx(1e-3 * 0.06 + 10.0 * sigma[TABLE])
     assert thresholds.loop_check_tolerance_m == pytest.approx(0.02 * 0.06)
+    unknown = compute_thresholds(PROFILE, RIG, {})
+    assert not unknown.has_noise.any()
+    assert np.isinf(unknown.stuck_run).all()
+    assert np.isfinite(unknown.visible_motion).tolist() == [True] * 3 + [False] * 6
     in_samples = {
-        "history": 0.25, "episode_samples": 1.0, "velocity_span": 0.01, "visible_run": 0.01,
-        "max_lost": 0.02, "max_lag": 0.1,
-    }  # fmt: skip
+        "history": 0.25,
+        "episode_samples": 1.0,
+        "velocity_span": 0.01,
+        "visible_run": 0.01,
+        "max_lost": 0.02,
+        "max_lag": 0.1,
+    }
     for name, seconds in in_samples.items():
         assert getattr(thresholds, name) == pytest.approx(seconds * rate_hz), name
     in_si = {
-        "stroke_m": 0.06, "velocity_m_s": 0.5, "acceleration_m_s2": GRAVITY_M_S2, "force_n": 30e3,
-        "table_kg": 2000.0, "mass_kg": 550.0, "drive_row": DRIVE, "table_row": TABLE,
-        "acceleration_row": ACC, "mass_row": MASS_ACC, "following_ratio": 0.15,
-        "initial_following_ratio": 0.25, "rate_hz": rate_hz,
-    }  # fmt: skip
+        "stroke_m": 0.06,
+        "velocity_m_s": 0.5,
+        "acceleration_m_s2": GRAVITY_M_S2,
+        "force_n": 30e3,
+        "table_kg": 2000.0,
+        "mass_kg": 550.0,
+        "drive_row": DRIVE,
+        "table_row": TABLE,
+        "acceleration_row": ACC,
+        "mass_row": MASS_ACC,
+        "following_ratio": 0.15,
+        "initial_following_ratio": 0.25,
+        "rate_hz": rate_hz,
+    }
     for name, value in in_si.items():
         assert getattr(thresholds, name) == pytest.approx(value), name
 
 
-def test_a_sensor_whose_noise_is_not_known_proves_nothing() -> None:
-    thresholds = compute_thresholds(make_profile(2000.0), RIG, {})
-    assert not thresholds.has_noise.any()
-    assert np.isinf(thresholds.stuck_run).all()
-    assert np.isfinite(thresholds.visible_motion).tolist() == [True] * 3 + [False] * 6
-
-
-def test_a_table_that_may_deviate_more_may_so_before_it_is_known() -> None:
+def test_initial_following_ratio_is_at_least_that_of_the_rig() -> None:
     for ratio, initial in ((0.1, 0.25), (0.4, 0.4)):
         response = RIG.table_response.model_copy(update={"following_ratio": ratio})
         rig = RIG.model_copy(update={"table_response": response})
-        thresholds = compute_thresholds(make_profile(2000.0), rig, NOISE)
+        thresholds = compute_thresholds(PROFILE, rig, NOISE_SI)
         assert (thresholds.following_ratio, thresholds.initial_following_ratio) == (ratio, initial)
 
 
 # Findings and keys
 
 
-def test_faults_of_the_machine_stop_it_and_those_of_sensors_as_the_profile_says() -> None:
+def test_to_finding_reaction() -> None:
     stops = {STROKE, VELOCITY, ACCELERATION, FORCE, COMMAND, FOLLOWING}
     alarms = {LOST, DROPPED, SPIKE, REPEATED}
     for reaction in ("stop", "warn"):
-        profile = make_profile(2000.0).model_copy(
-            update={"protection": ProtectionConfig(sensor=reaction)}
-        )
+        profile = PROFILE.model_copy(update={"protection": ProtectionConfig(sensor=reaction)})
         for code in range(sample_checks.CODE_COUNT):
             for name in RIG.channels:
                 channel = RIG.channel_by_name[name]
@@ -531,19 +533,26 @@ def test_faults_of_the_machine_stop_it_and_those_of_sensors_as_the_profile_says(
                 assert (finding.value, finding.limit) == (3.0, 2.0)
 
 
-def test_values_are_stated_in_the_unit_of_their_limit() -> None:
+def test_to_finding_unit() -> None:
     """The first number of a message that is neither sample nor name is the value, in its unit."""
     scales = {
-        STROKE: 1e3, VELOCITY: 1e3, ACCELERATION: 1 / GRAVITY_M_S2, FORCE: 1e-3, BLIND: 1e3,
-        REPEATED: 1e3, COMMAND: 1e3, FOLLOWING: 1e3, STUCK: 1.0,
-    }  # fmt: skip
+        STROKE: 1e3,
+        VELOCITY: 1e3,
+        ACCELERATION: 1 / GRAVITY_M_S2,
+        FORCE: 1e-3,
+        BLIND: 1e3,
+        REPEATED: 1e3,
+        COMMAND: 1e3,
+        FOLLOWING: 1e3,
+        STUCK: 1.0,
+    }
     channel = RIG.channel_by_name["table_acc_m_s2"]
     for code, scale in scales.items():
-        text = to_finding(code, 12, channel, 3.217, 2.0, make_profile(2000.0)).text
+        text = to_finding(code, 12, channel, 3.217, 2.0, PROFILE).text
         assert f"{3.217 * scale:.4g}" in text.replace(",", " ").split(), code
 
 
-def test_each_motion_has_a_key() -> None:
+def test_motion_keys() -> None:
     held = (Label.SETTLE, Label.MEASURE, Label.CHECK)
     for step in (-1, 0, 3):
         labels = np.array([int(label) for label in Label])
