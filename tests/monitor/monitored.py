@@ -24,6 +24,7 @@ from table_io.records import (
 )
 from table_io.units import GRAVITY_M_S2
 from twin.compare import COMPARED_CHANNELS
+from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.transport.codec import Item
 
 RUN, RATE, LEVEL = "20260101-120000-watched", 1000.0, 0.05 * GRAVITY_M_S2
@@ -40,6 +41,14 @@ SENSORS = (
     "force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n",
 )  # fmt: skip
 PROFILE = Path(PROFILES_DIR / "tests" / "quickstart.toml").read_text()
+
+
+def receive(*items: Item, state: LiveRunState | None = None, run: str = RUN) -> LiveRunState:
+    """Return the state of the run after the items, from an earlier state if given."""
+    state = state or LiveRunState()
+    for item in items:
+        state = update_run_state(state, run, item)
+    return state
 
 
 def start(run: str = RUN) -> RunStart:

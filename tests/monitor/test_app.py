@@ -26,8 +26,8 @@ from tests.live.test_live import endpoint
 from tests.monitor.monitored import RUN, block, point, records, start, stream
 from twin.monitor import app
 from twin.monitor.app import MonitorClient, TerminalDisplay, run_event_loop, run_monitor
-from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState
+from twin.monitor.run_view import RunView, SessionStatus
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
 
@@ -169,8 +169,12 @@ class Still:
     def listen(self, seconds: float) -> list[Item]:
         return []
 
-    def session_status(self, asked: str = "") -> SessionStatus:
-        return SessionStatus(may_command=self.commands, pending_command=asked)
+    def session_status(self) -> SessionStatus:
+        return SessionStatus(may_command=self.commands)
+
+    def view(self, pending: str = "") -> RunView:
+        status = SessionStatus(may_command=self.commands, pending_command=pending)
+        return RunView(self.run_state, status)
 
 
 @pytest.mark.parametrize(

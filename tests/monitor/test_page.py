@@ -8,14 +8,13 @@ import pytest
 
 from table_io.records import Event, RunStop
 from tests.monitor.browser import PATIENCE_S, Browser, open_browser
-from tests.monitor.monitored import RUN, point, records, stream
-from tests.monitor.test_page_data import watch_items
+from tests.monitor.monitored import RUN, point, receive, records, stream
 from tests.monitor.test_page_server import Served, serving
 from tests.security.laboratory import laboratory, own
 from twin.monitor.page_data import build_sections
 from twin.monitor.page_server import CommandAnswer, PageCommand, PageServer, open_page_server
-from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState, update_run_state
+from twin.monitor.run_view import RunView, SessionStatus
 from twin.security.access_control import user_name
 
 HAS_INK = """((canvas) => canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height)
@@ -29,11 +28,11 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 
 def show(page: Served, state: LiveRunState) -> None:
-    page.feed.publish(build_sections(state, SessionStatus()))
+    page.feed.publish(build_sections(RunView(state, SessionStatus())))
 
 
 def test_the_page_shows_a_test_as_it_goes_on(browser: Browser) -> None:
-    state = watch_items(*records(), *stream())
+    state = receive(*records(), *stream())
     with serving(answer=403) as page:
         show(page, state)
         browser.open(f"http://127.0.0.1:{page.port}/", width=420, dark=True)
@@ -74,8 +73,8 @@ def test_the_page_shows_a_test_as_it_goes_on(browser: Browser) -> None:
 
 def test_the_page_draws_sections_as_they_arrive(browser: Browser) -> None:
     """A slow network delivers the first message in pieces; drawing survives a damaged one."""
-    state = watch_items(*records(), *stream())
-    sections = build_sections(state, SessionStatus())
+    state = receive(*records(), *stream())
+    sections = build_sections(RunView(state, SessionStatus()))
     with serving() as page:
         page.feed.publish({name: sections[name] for name in ("run", "state")})
         browser.open(f"http://127.0.0.1:{page.port}/")
@@ -99,7 +98,7 @@ def test_a_command_without_an_answer_points_to_the_emergency_stop(browser: Brows
     with serving() as page:
         page.server.handle_command = never_answer
         page.feed.role = "command"
-        show(page, watch_items(*records()))
+        show(page, receive(*records()))
         browser.open(f"http://127.0.0.1:{page.port}/")
         browser.evaluate("answerMs = 500")
         browser.wait_for("!$('commands').hidden")
@@ -114,7 +113,7 @@ def test_a_command_without_an_answer_points_to_the_emergency_stop(browser: Brows
 def test_a_code_is_taken_as_keyboards_write_it(browser: Browser, tmp_path: Path) -> None:
     """A dash for a hyphen, as phones write it; a wrong code asks again."""
     with serving(own(laboratory(tmp_path / "lab"), "anna")) as page:
-        show(page, watch_items(*records()))
+        show(page, receive(*records()))
         browser.open("about:blank")
         browser.open(f"http://127.0.0.1:{page.port}/")
         dashed = page.server.access.code.upper().replace("-", "–")
@@ -126,7 +125,7 @@ def test_a_code_is_taken_as_keyboards_write_it(browser: Browser, tmp_path: Path)
 
 
 def test_the_page_finds_its_server_again(browser: Browser) -> None:
-    state = watch_items(*records())
+    state = receive(*records())
     with serving() as page:
         show(page, state)
         browser.open(f"http://127.0.0.1:{page.port}/")

@@ -10,25 +10,18 @@ import pytest
 
 from table_io.block import Block, recut_blocks
 from table_io.records import RunStop
-from tests.monitor.monitored import LEVEL, RATE, RUN, block, point, records, start, stream
+from tests.monitor.monitored import LEVEL, RATE, RUN, block, point, receive, records, start, stream
 from twin.monitor.page_data import build_sections
-from twin.monitor.panels import SessionStatus
+from twin.monitor.recent import MAX_TRACE_POINTS, MAX_TRACE_S, TraceBuffer
 from twin.monitor.run_state import LiveRunState, update_run_state
-from twin.monitor.traces import MAX_TRACE_POINTS, MAX_TRACE_S, TraceBuffer
+from twin.monitor.run_view import RunView, SessionStatus
 from twin.transport.codec import Item
-
-
-def watch_items(*items: Item) -> LiveRunState:
-    state = LiveRunState()
-    for item in items:
-        state = update_run_state(state, RUN, item)
-    return state
 
 
 def sections_of(state: LiveRunState, **status: Any) -> dict[str, Any]:
     return {
         name: json.loads(text, parse_constant=pytest.fail)
-        for name, text in build_sections(state, SessionStatus(**status)).items()
+        for name, text in build_sections(RunView(state, SessionStatus(**status))).items()
     }
 
 
@@ -43,7 +36,7 @@ def predict(measured: Block, error_m: float) -> Block:
 
 
 def test_the_page_has_the_numbers_of_the_monitor() -> None:
-    sections = sections_of(watch_items(*records(), *stream()), components=frozenset({f"{RUN}.rig"}))
+    sections = sections_of(receive(*records(), *stream()), components=frozenset({f"{RUN}.rig"}))
     state, level = sections["state"], sections["level"]
     assert (state["state"], state["tone"], state["step"], state["steps"]) == (
         "running",
@@ -58,6 +51,7 @@ def test_the_page_has_the_numbers_of_the_monitor() -> None:
     margins = {row["name"]: row for row in sections["margins"]["rows"]}
     assert margins["force R1"] == {
         "name": "force R1", "peak": 4.0, "limit": 10.0, "unit": "kN", "share": 0.4,
+        "tone": "good",
     }  # fmt: skip
     assert [row["name"] for row in sections["twin"]["rows"] if row["exceeds"]] == ["u rel"]
     assert sections["events"]["rows"][0]["level"] == "WARN"
@@ -65,7 +59,7 @@ def test_the_page_has_the_numbers_of_the_monitor() -> None:
 
 
 def test_the_curves_grow_point_by_point_up_and_back() -> None:
-    state = watch_items(*records())
+    state = receive(*records())
     prc = sections_of(state)["prc"]
     assert (prc["count"], prc["range_hz"]) == (3, [2.0, 4.0])
     assert prc["forecast"] == {"kind": "down", "jump_hz": 3.982, "low_hz": 3.91, "high_hz": 4.05}
@@ -84,7 +78,7 @@ def test_the_last_cycles_are_shown_over_the_twin() -> None:
     items: list[Item] = [start()]
     for index in range(6000, 8000, 20):
         items += [block(index), predict(block(index), 1e-4)]
-    trace = sections_of(watch_items(*items))["trace"]
+    trace = sections_of(receive(*items))["trace"]
     tracks = trace["tracks"]
     assert trace["span_s"] == pytest.approx(3 / 3.5, rel=1e-4)
     assert tracks["measured"]["t"][0] == pytest.approx(-trace["span_s"], abs=0.01)
@@ -97,15 +91,15 @@ def test_the_last_cycles_are_shown_over_the_twin() -> None:
 
 def test_no_run_an_ended_one_and_a_silent_one_are_shown_as_such() -> None:
     assert sections_of(LiveRunState())["state"]["state"] == "waiting for a run"
-    ended = watch_items(*records(), RunStop(8000, "stopped", "asked to stop"))
+    ended = receive(*records(), RunStop(8000, "stopped", "asked to stop"))
     state = sections_of(ended, silent_s=100.0)["state"]
     assert (state["ended"], state["tone"], state["reason"]) == (True, "bad", "asked to stop")
-    silent = sections_of(watch_items(*records()), silent_s=65.0)["state"]
+    silent = sections_of(receive(*records()), silent_s=65.0)["state"]
     assert (silent["tone"], "0:01:05" in silent["state"]) == ("bad", True)
 
 
 def test_a_history_without_steps_has_no_curves() -> None:
-    sections = sections_of(watch_items(replace(start(), steps=()), block(100)))
+    sections = sections_of(receive(replace(start(), steps=()), block(100)))
     assert sections["prc"]["range_hz"] is None
     assert sections["level"] == {}
     assert sections["trace"]["span_s"] == 2.0

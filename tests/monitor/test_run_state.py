@@ -1,4 +1,4 @@
-"""The monitor's board: what is known of a run, whatever the order and however often it is told."""
+"""The state of a run as received, whatever the order and however often."""
 
 import random
 from dataclasses import replace
@@ -10,6 +10,7 @@ from table_io.block import Block, Label
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.excitation.drive import Drive
 from table_io.records import (
     Agreement,
     Estimate,
@@ -17,12 +18,14 @@ from table_io.records import (
     JumpForecast,
     Level,
     PrcPoint,
+    RunStart,
     RunStop,
     SampleGap,
     StepAdded,
     Timing,
     Trip,
 )
+from table_io.sequencer import make_test_plan, nominal_drive
 from tests.monitor.monitored import (
     LEVEL,
     PROFILE,
@@ -34,87 +37,79 @@ from tests.monitor.monitored import (
     block,
     make_comparison,
     point,
+    receive,
     records,
     start,
     stream,
 )
-from twin.monitor.margins import compute_live_margins
-from twin.monitor.recent import RecentSamples
+from twin.monitor.recent import RecentSamples, compute_live_margins
 from twin.monitor.run_state import MAX_COMPONENTS, MAX_EVENTS, LiveRunState, update_run_state
 from twin.transport.codec import Item
 
 
-def board(items: list[Item], of: LiveRunState | None = None, run: str = RUN) -> LiveRunState:
-    """The board after the items."""
-    state = of or LiveRunState()
-    for item in items:
-        state = update_run_state(state, run, item)
-    return state
-
-
 def list_content(state: LiveRunState) -> tuple[object, ...]:
-    """What a board says, apart from its last second."""
+    """Return what a state holds, without its last seconds."""
     names = ("run", "start", "index", "rig_state", "added_steps", "points", "latest", "timings",
              "gaps", "stop")  # fmt: skip
     news = sorted((event.index, event.level, event.text) for event in state.events.values())
     return *(getattr(state, name) for name in names), news
 
 
-def test_order_and_repetition_change_nothing() -> None:
+def test_state_does_not_depend_on_order_and_repetition() -> None:
     items = records()
-    once = list_content(board(items))
-    assert board(items).rig_state == "running"
+    once = list_content(receive(*items))
+    assert receive(*items).rig_state == "running"
     shuffled = random.Random(1)
     for _ in range(20):
         several = [*items, *items]
         shuffled.shuffle(several)
-        assert list_content(board(several)) == once
+        assert list_content(receive(*several)) == once
 
 
-def test_the_newest_record_of_a_kind_stays() -> None:
+def test_newest_record_of_a_kind_stays() -> None:
     ahead = JumpForecast(100, 1, "forward", 2.5, "down", 3.9, 3.8, 4.0)
     later = replace(ahead, index=200, jump_hz=3.7)
-    assert board([start(), later, ahead]).get_latest(JumpForecast) == later
-    assert board([start(), ahead, later]).get_latest(JumpForecast) == later
-    assert board([start()]).get_latest(JumpForecast) is None
+    assert receive(start(), later, ahead).get_latest(JumpForecast) == later
+    assert receive(start(), ahead, later).get_latest(JumpForecast) == later
+    assert receive(start()).get_latest(JumpForecast) is None
 
 
-def test_a_new_run_begins_with_an_empty_board_and_the_old_one_stays_away() -> None:
-    state = board([*records(), *stream(), RunStop(8000, "complete", "all driven")])
+def test_new_run_replaces_the_state_and_the_old_one_is_ignored() -> None:
+    state = receive(*records(), *stream(), RunStop(8000, "complete", "all driven"))
     following = "20260102-120000-next"
-    state = board([Event(0, "state", "checking"), start(following)], state, following)
+    state = receive(Event(0, "state", "checking"), start(following), state=state, run=following)
     assert (state.run, state.rig_state, state.points, state.stop) == (
         following,
         "checking",
         {},
         None,
     )
-    late = board([start(), point(4)], state, RUN)
+    late = receive(start(), point(4), state=state, run=RUN)
     assert late is state
     assert not late.points
 
 
-def test_only_a_start_makes_way_for_another_run() -> None:
+def test_items_of_another_run_wait_for_its_start() -> None:
     before = update_run_state(LiveRunState(), "of another run", point(4))
-    state = board([point(1), point(2), start()], before)
+    state = receive(point(1), point(2), start(), state=before)
     assert sorted(state.points) == [1, 2]
-    assert board([point(3), block(0)], state, "of another run") is state
+    assert receive(point(3), block(0), state=state, run="of another run") is state
     assert sorted(state.points) == [1, 2]
 
 
-def test_a_replay_that_begins_again_is_shown_from_its_beginning() -> None:
-    state = board([*records(), *stream(), RunStop(8000, "complete", "all driven")])
-    again = board([block(0, step=0, label=Label.REST)], state)
+def test_replay_that_begins_again_clears_the_state() -> None:
+    state = receive(*records(), *stream(), RunStop(8000, "complete", "all driven"))
+    again = receive(block(0, step=0, label=Label.REST), state=state)
     assert (again.points, again.stop, again.index) == ({}, None, 20)
     assert again.start == state.start
-    assert board([block(7000)], state).points == state.points  # an old block alone is none
+    assert receive(block(7000), state=state).points == state.points  # an old block alone is none
 
 
-def test_it_stays_small() -> None:
+def test_state_is_bounded() -> None:
     flood: list[Item] = [Event(k, "warning", f"number {k}") for k in range(5 * MAX_EVENTS)]
     flood += [Timing(k, f"c{k}", 1.0, 1.0, 1.0, 0, 1, 0.0, "") for k in range(5 * MAX_COMPONENTS)]
     flood += [SampleGap(k, 1, f"c{k}", "lost") for k in range(5 * MAX_COMPONENTS)]
-    state = board([start(), *flood])
+    state = receive(start(), *flood)
     assert (len(state.events), len(state.timings), len(state.gaps)) == (
         MAX_EVENTS,
         MAX_COMPONENTS,
@@ -128,27 +123,27 @@ def test_it_stays_small() -> None:
     assert sum(comparison.count for comparison in state.recent.comparisons) <= RATE + 40
 
 
-def test_gaps_of_a_channel_are_one_sentence_with_their_sum() -> None:
+def test_gaps_of_a_channel_are_one_event_with_their_sum() -> None:
     gaps = [SampleGap(at, 20, "mass_acc_m_s2", "clipped") for at in range(100, 200, 20)]
-    state = board([start(), *gaps, *gaps])
+    state = receive(start(), *gaps, *gaps)
     assert state.gaps == {("mass_acc_m_s2", "clipped"): (200, 100)}
     assert [event.text for event in state.events.values()] == [
         "dropout: 100 samples of mass_acc_m_s2 clipped"
     ]
 
 
-def test_news_are_sentences_and_their_level_and_data_is_none() -> None:
+def test_events_have_a_level_and_data_are_none() -> None:
     trip = Trip(500, 520, "stroke", "table_disp_m", 0.07, 0.06, "the table moved too far")
     level = Level(510, 0, LEVEL, LEVEL, 1.0, 0, True, ())
-    state = board([start(), trip, level])
+    state = receive(start(), trip, level)
     assert [(event.level, event.text) for event in state.events.values()] == [
         ("ERROR", "protection (stroke): the table moved too far")
     ]
 
 
-def test_a_step_that_was_decided_on_is_known() -> None:
-    state = board([start(), StepAdded(10, 12, "forward", 3.21, LEVEL, "refined"),
-                   replace_step(block(20), 12)])  # fmt: skip
+def test_added_step_is_known() -> None:
+    state = receive(start(), StepAdded(10, 12, "forward", 3.21, LEVEL, "refined"),
+                   replace_step(block(20), 12))  # fmt: skip
     assert state.step is not None
     assert state.step.frequency_hz == 3.21
     assert state.step_count == 13
@@ -158,14 +153,14 @@ def replace_step(block: Block, number: int) -> Block:
     return replace(block, step=np.full(len(block), number))
 
 
-def test_a_start_whose_cards_cannot_be_read_is_still_a_start() -> None:
-    state = board([replace(start(), rig_toml="[", profile_toml="what = 1")])
+def test_start_with_unreadable_files_is_still_a_start() -> None:
+    state = receive(replace(start(), rig_toml="[", profile_toml="what = 1"))
     assert (state.rig, state.profile) == (None, None)
     assert state.step_count == len(STEPS)
 
 
-def test_what_cannot_be_in_a_run_is_left_out() -> None:
-    whole = board([start()])
+def test_invalid_items_are_ignored() -> None:
+    whole = receive(start())
     first = block(0)
     (agreement,) = (record for record in records() if isinstance(record, Agreement))
     (estimate,) = (record for record in records() if isinstance(record, Estimate))
@@ -178,9 +173,9 @@ def test_what_cannot_be_in_a_run_is_left_out() -> None:
         replace(first, rate_hz=17.0),
         replace(start(), rate_hz=0.0),
     ):
-        assert list_content(board([bad], board([start()]))) == list_content(whole)
-        assert board([bad], board([start()])).position == whole.position
-    assert board([replace(start(), rate_hz=0.0)]).start is None
+        assert list_content(receive(bad, state=receive(start()))) == list_content(whole)
+        assert receive(bad, state=receive(start())).position == whole.position
+    assert receive(replace(start(), rate_hz=0.0)).start is None
 
 
 def recent(blocks: list[Block], cycle_s: float = 0.3) -> RecentSamples:
@@ -216,8 +211,8 @@ def test_no_level_before_a_cycle_is_held_or_where_samples_are_missing() -> None:
 
 
 def test_errors_are_rms_of_the_last_second() -> None:
-    errors = board(
-        [start(), *(make_comparison(at) for at in range(0, 3000, 20))]
+    errors = receive(
+        start(), *(make_comparison(at) for at in range(0, 3000, 20))
     ).recent.twin_errors()
     assert errors["rel_disp_m"] == pytest.approx((1e-3, 1e-4, 2e-4))
     assert RecentSamples().twin_errors() == {}
@@ -261,6 +256,78 @@ def test_margins_know_only_the_last_second() -> None:
 
 
 def test_points_are_kept_by_step() -> None:
-    state = board([start(), point(1), point(0), point(1)])
+    state = receive(start(), point(1), point(0), point(1))
     assert sorted(state.points) == [0, 1]
     assert all(isinstance(point, PrcPoint) for point in state.points.values())
+
+
+SHORT_SWEEP = """
+title = "Two frequencies"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[sweep]
+start_hz = 2.0
+stop_hz = 2.5
+step_hz = 0.5
+cycles = 4
+measured_cycles = 2
+directions = ["forward"]
+[acquisition]
+rate_hz = 1000.0
+"""
+
+
+def start_sweep() -> tuple[RunStart, Drive]:
+    """Return the start record of a short sweep, and its nominal drive."""
+    profile = parse_toml(SHORT_SWEEP, Profile, "profile")
+    drive = nominal_drive(make_test_plan(profile, parse_toml(RIG, RigConfig, "rig")))
+    planned = {"steps": drive.steps, "planned_samples": drive.planned_end}
+    return replace(start(), profile_toml=SHORT_SWEEP, **planned), drive  # type: ignore[arg-type]
+
+
+def drive_blocks(drive: Drive, shift: int, first: int, end: int) -> list[Block]:
+    """Return blocks with the labels of a drive that runs `shift` samples late."""
+    labels = [drive.labels(index - shift, 20) for index in range(first, end, 20)]
+    return [
+        replace(block(index), step=step, label=label, cycle=cycle)
+        for index, (step, label, cycle) in zip(range(first, end, 20), labels, strict=True)
+    ]
+
+
+def test_time_left_is_the_planned_one_as_long_as_nothing_happens() -> None:
+    begin, drive = start_sweep()
+    for end in (2000, drive.planned_end // 2, drive.planned_end - 100):
+        state = receive(begin, *drive_blocks(drive, 0, 0, end))
+        assert state.index + 1000 * state.remaining_s == pytest.approx(drive.planned_end, abs=40)
+
+
+def settle(step: int, first: int, end: int) -> list[Block]:
+    """Return blocks at a step that is being tuned or held, without held cycles."""
+    return [
+        replace(block(index, step=step, label=Label.SETTLE), cycle=np.full(20, -1))
+        for index in range(first, end, 20)
+    ]
+
+
+def test_time_left_stays_while_a_step_is_tuned_again_or_held() -> None:
+    begin, drive = start_sweep()
+    held = {segment.step: segment.start for segment in drive.sine_segments if segment.cycles}
+    first = held[0] // 20 * 20 - 20
+    state = receive(begin, *drive_blocks(drive, 0, 0, first), *settle(0, first, first + 2000))
+    assert state.remaining_s == pytest.approx((drive.planned_end - held[0]) / RATE, abs=0.03)
+    receive(*drive_blocks(drive, 2000, first + 2000, held[1] + 2100), state=state)
+    assert state.index + RATE * state.remaining_s == pytest.approx(drive.planned_end + 2000, abs=40)
+    hold, begin_of_hold = Event(state.index, "state", "holding"), state.index
+    receive(hold, *settle(1, begin_of_hold, begin_of_hold + 3000), state=state)
+    # The step is measured again from its first held cycle.
+    assert state.remaining_s == pytest.approx((drive.planned_end - held[1]) / RATE, abs=0.03)
+
+
+def test_time_left_grows_with_an_added_step() -> None:
+    begin, drive = start_sweep()
+    planned = receive(begin, *drive_blocks(drive, 0, 0, drive.planned_end))
+    added = StepAdded(drive.planned_end, 2, "forward", 2.25, LEVEL, "refined")
+    state = receive(added, added, state=planned)
+    assert state.remaining_s > 4 / 2.25
+    assert state.remaining_s < 4 / 2.25 + 4.0  # blend and tuning

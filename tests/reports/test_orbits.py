@@ -13,13 +13,14 @@ from tests.model.reference import snm
 from tests.reports.recordings import start_record
 from twin.monitor.curves import draw_prc
 from twin.monitor.run_state import LiveRunState
+from twin.monitor.run_view import RunView, SessionStatus
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.report.report import write_report
 from twin.results.orbits import find_measured_folds, read_planned_branch
 from twin.results.summary import parse_toml_tables, summarise, write_summary
 from twin.transport.codec import decode_item, encode_item, topic_for
-from twin.viewer.plots import OrbitCurves
+from twin.viewer.plots import FrequencyCurves
 
 AMPLITUDE_M = 2e-3
 PROFILE = """
@@ -131,7 +132,7 @@ def test_report_of_a_backbone_shows_the_phase(tmp_path):
 
 
 def test_view_draws_accepted_orbits_over_the_planned_ones():
-    curves = OrbitCurves(make_plan())
+    curves = FrequencyCurves(0.0, 1.0, make_plan())
     assert curves.get_curves("measured") == []
     for step in (1, 0, 2):
         curves.add(make_point(step, "not on the branch" if step == 2 else ""))
@@ -146,7 +147,7 @@ def test_monitor_draws_orbits_in_place_of_the_curves():
     run_state = LiveRunState(run=start.run)
     run_state.profile = parse_toml(start.profile_toml, Profile, "profile")
     run_state.orbits[1] = make_point(1)
-    text = "\n".join(line.plain for line in draw_prc(run_state, 60, 12))
+    text = "\n".join(line.plain for line in draw_prc(RunView(run_state, SessionStatus()), 60, 12))
     assert text.count("●") == 1
     assert "3.2" in text
 

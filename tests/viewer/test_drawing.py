@@ -5,9 +5,9 @@ import pytest
 
 from table_io.block import Block, join_contiguous
 from tests.viewer.example_run import RATE_HZ, SAMPLE_COUNT, blocks
-from twin.viewer.levels import WindowPeaks, next_power_of_ten
 from twin.viewer.motion import Trail, extract_motion
 from twin.viewer.plots import AxisRange, PlotAxes
+from twin.viewer.scaled_plots import WindowPeaks, next_power_of_ten
 from twin.viewer.scene import Scene
 
 

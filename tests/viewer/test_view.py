@@ -22,7 +22,7 @@ from tests.viewer.example_run import (
     scalars,
     start,
 )
-from twin.viewer.plots import PrcCurves
+from twin.viewer.plots import FrequencyCurves
 from twin.viewer.view import RerunView, write_rrd
 
 LINE_STRIDE = 4  # lines are drawn with 500 points per second
@@ -88,7 +88,7 @@ def test_disagreement_estimates_and_the_jump_ahead(whole: Path) -> None:
     assert scalars(whole, "/gaps/gap_r")[1] == pytest.approx(np.array([[0.02, 0.04, 0.0]]))
     marks = shown["/prc/ahead"]["LineStrips2D:strips"][1]
     assert [len(row) for row in marks] == [2, 0]  # the end at 9 Hz is off the axes
-    axes = PrcCurves(0.5, 5.0).axes
+    axes = FrequencyCurves(0.5, 5.0).axes
     places = [axes.origin[0] + axes.scale[0] * hz for hz in (2.3, 2.4)]
     assert [strip[0][0] for strip in marks[0]] == pytest.approx(places, rel=1e-5)
     document = shown["/ahead"]["TextDocument:text"][1]

@@ -16,9 +16,9 @@ from table_io.clock import RealClock
 from table_io.errors import InputError
 from table_io.records import Comparison
 from twin.live.control import send_command
-from twin.monitor.panels import SessionStatus
 from twin.monitor.run_state import LiveRunState, update_run_state
-from twin.monitor.screen import COMMAND_KEYS, SILENT_S, draw_screen
+from twin.monitor.run_view import SILENT_S, RunView, SessionStatus
+from twin.monitor.screen import COMMAND_KEYS, draw_screen
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
 from twin.system.progress import RunProgress
@@ -40,10 +40,9 @@ LIVE_TOPICS = (MEAS_TOPIC, COMPARISON_TOPIC)  # without history: old samples are
 HISTORY_TOPICS = tuple(topic for topic in RECORD_TOPICS.values() if topic not in STREAM_TOPICS)
 DEFAULT_SIZE = 120, 40
 CommandSender = Callable[[str], str]  # command -> result for the user
-BEGIN_UPDATE, END_UPDATE = (
-    "\x1b[?2026h",
-    "\x1b[?2026l",
-)  # synchronized update: the terminal shows a frame at once
+# Synchronized update: the terminal shows a frame at once.
+BEGIN_UPDATE = "\x1b[?2026h"
+END_UPDATE = "\x1b[?2026l"
 
 
 class TerminalDisplay:
@@ -130,6 +129,10 @@ class MonitorClient:
         return SessionStatus(
             frozenset(self._components), silent_s, self.role == "command", pending_command
         )
+
+    def view(self, pending_command: str = "") -> RunView:
+        """Return what is shown of the run now."""
+        return RunView(self.run_state, self.session_status(pending_command))
 
     def wait_for_run(self, wait: bool) -> None:
         """Listen until a run is known and one second of it received.
@@ -221,9 +224,7 @@ def run_event_loop(client: MonitorClient, display: TerminalDisplay, send: Comman
         client.listen(POLL_S)
         if key or clock.now() >= drawn_s + FRAME_S:
             drawn_s = clock.now()
-            display.show(
-                draw_screen(client.run_state, client.session_status(pending), *display.size)
-            )
+            display.show(draw_screen(client.view(pending), *display.size))
 
 
 def submit_command(command: str, connect: str, rig: str, credentials: Credentials | None) -> str:
@@ -260,7 +261,7 @@ def print_progress(client: MonitorClient) -> None:
 def write_snapshot(client: MonitorClient, picture: Path | None) -> None:
     """Write the screen once, as text to the console or as a new .svg file."""
     width, height = console.size if console.is_terminal or "COLUMNS" in os.environ else DEFAULT_SIZE
-    lines = draw_screen(client.run_state, client.session_status(), width, height)
+    lines = draw_screen(client.view(), width, height)
     if picture is None:
         for line in lines:
             console.print(line, soft_wrap=True, highlight=False)

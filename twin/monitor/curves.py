@@ -1,7 +1,6 @@
 """Pseudo-resonance curves of the points so far, measured and twin, in braille characters."""
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby, pairwise
 
@@ -9,19 +8,18 @@ import numpy as np
 from rich.text import Text
 
 from table_io.block import Float2D
-from table_io.config.excitation.orbit_plan import OrbitPlan
-from table_io.records import NormalizedResponse, OrbitPoint, PrcPoint
 from twin.monitor.panels import DIM_STYLE
-from twin.monitor.run_state import LiveRunState
+from twin.monitor.run_view import RunView, eta_d
 from twin.viewer.plots import nice_ceil
+from twin.viewer.view_model import ResponseQuantity
 
-FORWARD_COLOUR, BACKWARD_COLOUR, TWIN_COLOUR, STEP_COLOUR = (
-    "bright_red",
-    "dodger_blue1",
-    "white",
-    "grey30",
-)
-ResponseQuantity = Callable[[NormalizedResponse], float]
+FORWARD_COLOUR, BACKWARD_COLOUR = "bright_red", "dodger_blue1"
+TWIN_COLOUR, STEP_COLOUR = "white", "grey30"
+CURVE_MARKS = {  # style and mark
+    ("twin", "forward"): (TWIN_COLOUR, "○"), ("twin", "backward"): (DIM_STYLE, "○"),
+    ("measured", "forward"): (FORWARD_COLOUR, ""), ("measured", "backward"): (BACKWARD_COLOUR, ""),
+    ("orbit", "forward"): (FORWARD_COLOUR, "●"), ("orbit", "backward"): (BACKWARD_COLOUR, "●"),
+}  # fmt: skip
 DOT_BITS = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
 BLANK_BRAILLE = 0x2800
 AXIS_STYLE = "grey50"
@@ -34,93 +32,32 @@ class PlotCurve:
     """Curve of points (x, y) joined by lines, with a rich style and a mark where it fits."""
 
     style: str
+    mark: str
     points: Sequence[tuple[float, float]]
-    mark: str = ""
 
 
-def eta_d(quantities: NormalizedResponse) -> float:
-    """Return the displacement ratio."""
-    return quantities.eta_d
+def draw_prc(view: RunView, width: int, height: int, value: ResponseQuantity = eta_d) -> list[Text]:
+    """Plot the PRC so far, measured in color, twin in white, with the frequency of the step.
 
-
-def eta_a(quantities: NormalizedResponse) -> float:
-    """Return the acceleration ratio."""
-    return quantities.eta_a
-
-
-def impacts_per_cycle(quantities: NormalizedResponse) -> float:
-    """Return mean impacts per measured cycle, both sides; NaN if the cells of a side are lost."""
-    cycles = min(len(quantities.impacts_right), len(quantities.impacts_left))
-    return (
-        (sum(quantities.impacts_right) + sum(quantities.impacts_left)) / cycles
-        if cycles
-        else math.nan
-    )
-
-
-def draw_prc(
-    run_state: LiveRunState, width: int, height: int, value: ResponseQuantity = eta_d
-) -> list[Text]:
-    """Plot the PRC so far, measured in color, twin in white, with the frequency of the step."""
-    if run_state.profile is not None and run_state.profile.continuation is not None:
-        plan = run_state.profile.continuation.orbit_plan
-        return draw_orbit_curves(plan, list(run_state.orbits.values()), width, height)
-    points = sorted(run_state.points.values(), key=lambda point: point.step)
-    frequencies_hz = [point.frequency_hz for point in points]
-    if run_state.start is not None:
-        frequencies_hz += [step.frequency_hz for step in run_state.start.steps]
-    if run_state.start is not None and not frequencies_hz:
-        return [Text("a displacement history has no curves over frequency", DIM_STYLE)]
-    if not frequencies_hz:
-        return [Text("waiting for the test plan", DIM_STYLE)]
-    curves, max_value = [], 0.0
-    for source in ("twin", "measured"):
-        for direction, style in (("forward", FORWARD_COLOUR), ("backward", BACKWARD_COLOUR)):
-            samples = select_prc_values(points, source, direction, value)
-            max_value = max([max_value, *(y for _, y in samples if math.isfinite(y))])
-            twin_style = TWIN_COLOUR if direction == "forward" else DIM_STYLE
-            curves.append(
-                PlotCurve(twin_style, samples, "○")
-                if source == "twin"
-                else PlotCurve(style, samples)
-            )
-    if points and (newest := points[-1].measured) is not None:
-        style = FORWARD_COLOUR if points[-1].direction == "forward" else BACKWARD_COLOUR
-        curves.append(PlotCurve(style, [(points[-1].frequency_hz, value(newest))], "●"))
-    y_max = nice_ceil(max_value or 1.0)
-    if run_state.step is not None:
-        frequency_hz = run_state.step.frequency_hz
-        curves.insert(0, PlotCurve(STEP_COLOUR, [(frequency_hz, 0.0), (frequency_hz, y_max)]))
-    x_range = min(frequencies_hz), max(frequencies_hz)
-    return plot_curves(curves, x_range, y_max, width, height, "Hz")
-
-
-def draw_orbit_curves(
-    plan: OrbitPlan, orbits: Sequence[OrbitPoint], width: int, height: int
-) -> list[Text]:
-    """Plot the amplitudes of measured orbits in mm over those of the plan, in white."""
-    planned = [(orbit.frequency_hz, 1e3 * orbit.amplitude_m) for orbit in plan.points]
-    curves = [PlotCurve(TWIN_COLOUR, planned)]
-    for orbit in orbits:
-        style = FORWARD_COLOUR if orbit.accepted else BACKWARD_COLOUR
-        curves.append(PlotCurve(style, [(orbit.frequency_hz, 1e3 * orbit.amplitude_m)], "●"))
-    frequencies_hz, amplitudes = zip(
-        *(point for curve in curves for point in curve.points), strict=True
-    )
-    x_range = min(frequencies_hz), max(frequencies_hz)
-    return plot_curves(curves, x_range, nice_ceil(max(amplitudes)), width, height, "Hz")
-
-
-def select_prc_values(
-    points: list[PrcPoint], source: str, direction: str, value: ResponseQuantity
-) -> list[tuple[float, float]]:
-    """Return (frequency in Hz, value) of measured or twin points of a direction, by frequency."""
-    samples = {}
-    for point in points:
-        quantities: NormalizedResponse | None = getattr(point, source)
-        if point.direction == direction and quantities is not None:
-            samples[point.frequency_hz] = value(quantities)
-    return sorted(samples.items())
+    Of a continuation, the amplitudes of measured orbits in mm over those of the plan.
+    """
+    plot = view.plot(value)
+    if plot.range_hz is None:
+        is_known = view.run_state.start is not None
+        text = "a displacement history has no curves over frequency"
+        return [Text(text if is_known else "waiting for the test plan", DIM_STYLE)]
+    y_max = nice_ceil(plot.highest or 1.0)
+    curves = [
+        PlotCurve(*CURVE_MARKS[curve.source, curve.direction], curve.points)
+        for curve in plot.curves
+    ]
+    if plot.newest is not None:
+        style, _ = CURVE_MARKS["orbit", plot.newest.direction]
+        curves.append(PlotCurve(style, "●", plot.newest.points))
+    if plot.step_hz is not None:
+        line = [(plot.step_hz, 0.0), (plot.step_hz, y_max)]
+        curves.insert(0, PlotCurve(STEP_COLOUR, "", line))
+    return plot_curves(curves, plot.range_hz, y_max, width, height, "Hz")
 
 
 def plot_curves(

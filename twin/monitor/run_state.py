@@ -36,8 +36,8 @@ from table_io.records import (
     Timing,
     format_record,
 )
-from twin.monitor.recent import WINDOW_S, RecentSamples
-from twin.monitor.traces import TraceBuffer
+from twin.monitor.expected_end import ExpectedEnd
+from twin.monitor.recent import WINDOW_S, RecentSamples, TraceBuffer
 from twin.recording.validation import (
     has_invalid_labels,
     validate_block,
@@ -86,6 +86,7 @@ class LiveRunState:
     gaps: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)  # end, samples
     events: dict[Hashable, EventLine] = field(default_factory=dict)
     stop: RunStop | None = None
+    expected_end: ExpectedEnd | None = None  # None: as planned
     recent: RecentSamples = field(default_factory=RecentSamples)
     traces: TraceBuffer = field(default_factory=TraceBuffer)
     pending: deque[tuple[str, Record]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
@@ -111,16 +112,21 @@ class LiveRunState:
         return max([len(self.start.steps) if self.start else 0, *(k + 1 for k in self.added_steps)])
 
     @property
+    def end(self) -> int:
+        """Sample at which the test is expected to end; 0 if that is not known."""
+        if self.expected_end is not None:
+            return self.expected_end.index
+        return self.start.planned_samples if self.start else 0
+
+    @property
     def progress(self) -> float | None:
-        """Share of the planned samples that are acquired, at most 1; None without a plan."""
-        planned = self.start.planned_samples if self.start else 0
-        return min(self.index / planned, 1.0) if planned > 0 else None
+        """Share of the expected samples that are acquired, at most 1; None without a plan."""
+        return min(self.index / self.end, 1.0) if self.end > 0 else None
 
     @property
     def remaining_s(self) -> float:
-        """Planned time left in s; negative if the test takes longer than planned."""
-        planned = self.start.planned_samples if self.start else 0
-        return (planned - self.index) / self.rate_hz
+        """Expected time left in s; negative if the test takes longer than expected."""
+        return (self.end - self.index) / self.rate_hz
 
     def add_message(self, text: str) -> None:
         """Add a message of the monitor itself to the events."""
@@ -164,9 +170,21 @@ def _start_run(previous: LiveRunState, start: RunStart) -> LiveRunState:
         run_state.profile = parse_toml(start.profile_toml, Profile, "profile of the run")
     with contextlib.suppress(InputError):
         run_state.rig = parse_toml(start.rig_toml, RigConfig, "rig file of the run")
+    run_state.expected_end = _expect_end(run_state)
     for run, record in previous.pending:
         update_run_state(run_state, run, record)
     return run_state
+
+
+def _expect_end(run_state: LiveRunState) -> ExpectedEnd | None:
+    """Return the expected end by the profile of the run; None if it cannot be computed."""
+    start, profile, rig = run_state.start, run_state.profile, run_state.rig
+    if start is None or profile is None or rig is None:
+        return None
+    try:
+        return ExpectedEnd(start, profile, rig)
+    except (InputError, ArithmeticError):
+        return None
 
 
 def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRunState:
@@ -181,10 +199,13 @@ def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRu
         run_state = LiveRunState(
             run_state.run, run_state.past_runs, start, run_state.profile, run_state.rig
         )
+        run_state.expected_end = _expect_end(run_state)
     run_state.index, run_state.block_end = max(run_state.index, block.end), block.end
     run_state.position = int(block.step[-1]), int(block.label[-1]), int(block.cycle[-1])
     run_state.recent.add(block, 1.0 / run_state.step.frequency_hz if run_state.step else 0.0)
     run_state.traces.add(block)
+    if run_state.expected_end is not None:
+        run_state.expected_end.add_block(block, run_state.rig_state == "holding")
     return run_state
 
 
@@ -202,7 +223,10 @@ def _add_record(run_state: LiveRunState, record: Record) -> None:
         case OrbitPoint():
             _put_bounded(run_state.orbits, record.step, record, MAX_POINTS)
         case StepAdded(step=index, direction=direction, frequency_hz=f, acceleration_m_s2=a):
-            _put_bounded(run_state.added_steps, index, Step(index, direction, f, a), MAX_POINTS)
+            step = Step(index, direction, f, a)
+            _put_bounded(run_state.added_steps, index, step, MAX_POINTS)
+            if run_state.expected_end is not None:
+                run_state.expected_end.add_step(step, record.index)
         case Timing():
             _put_bounded(run_state.timings, record.component, record, MAX_COMPONENTS)
         case Agreement() | JumpForecast() | CycleExtremes() | Estimate() | Level():

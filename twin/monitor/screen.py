@@ -7,36 +7,18 @@ from functools import partial
 import numpy as np
 from rich.text import Text
 
-from table_io.block import Label
-from table_io.config.excitation.stepped_sine import Sweep
 from table_io.errors import replace_nonprintable
-from table_io.records import LABEL_TEXTS
 from twin.monitor import curves, panels
-from twin.monitor.panels import (
-    BAD_STYLE,
-    DIM_STYLE,
-    GOOD_STYLE,
-    WARN_STYLE,
-    SessionStatus,
-    draw_bar,
-    format_duration,
-)
-from twin.monitor.run_state import LiveRunState
+from twin.monitor.panels import DIM_STYLE, GOOD_STYLE, STYLES, WARN_STYLE, draw_bar
+from twin.monitor.run_view import Progress, RunView, SessionStatus, eta_a, format_duration
+from twin.viewer.view_model import impacts_per_cycle
 
 MIN_SIZE = 40, 10
-SILENT_S = 2.0  # without data; blocks arrive a hundred times per second
 COLUMN_SPACING = 2  # blank cells between panels
 RULE_STYLE = "grey35"
-STATE_STYLES = {
-    "running": GOOD_STYLE, "checking": GOOD_STYLE, "armed": GOOD_STYLE,
-    "holding": WARN_STYLE, "stopping": WARN_STYLE,
-    "at rest": "", "idle": "", "fault": BAD_STYLE,
-    "waiting": WARN_STYLE, "following": GOOD_STYLE, "astray": BAD_STYLE, "left": BAD_STYLE,
-}  # fmt: skip
-STATE_TEXTS = {"astray": "drive lost", "left": "ended in motion"}  # shown for recorded states
 COMMAND_KEYS = {"h": "hold", "r": "resume", "s": "stop", "a": "abort"}
 ARROWS = {"forward": "↑", "backward": "↓"}
-DrawPanel = Callable[[LiveRunState, int, int], list[Text]]
+DrawPanel = Callable[[RunView, int, int], list[Text]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,10 +47,10 @@ PHASES_PANEL = Panel("Error of the last cycle by phase", panels.draw_phases, 8, 
 SPECIMEN_PANEL = Panel("Identified parameters", panels.draw_specimen, 1, 7)
 TIMING_PANEL = Panel("Latency in ms", panels.draw_timing, 4, 8)
 ETA_D_PANEL = Panel("PRC η_d", curves.draw_prc, 8, 20, is_growing=True, legend=PRC_LEGEND)
-ETA_A_PANEL = Panel("PRC η_a", partial(curves.draw_prc, value=curves.eta_a), 8, 20, is_growing=True)
+ETA_A_PANEL = Panel("PRC η_a", partial(curves.draw_prc, value=eta_a), 8, 20, is_growing=True)
 IMPACT_RATE_PANEL = Panel(
     "Impacts per cycle, R + L",
-    partial(curves.draw_prc, value=curves.impacts_per_cycle),
+    partial(curves.draw_prc, value=impacts_per_cycle),
     8,
     16,
     is_growing=True,
@@ -92,18 +74,16 @@ LARGE_LAYOUT = (
 )
 
 
-def draw_screen(
-    run_state: LiveRunState, status: SessionStatus, width: int, height: int
-) -> list[Text]:
+def draw_screen(view: RunView, width: int, height: int) -> list[Text]:
     """Draw the screen as `height` lines of at most `width` cells."""
     if width < MIN_SIZE[0] or height < MIN_SIZE[1]:
         return [Text(f"needs {MIN_SIZE[0]} x {MIN_SIZE[1]}"[:width])] + [Text()] * (height - 1)
-    top = [_draw_title(run_state, status, width), _draw_progress(run_state, width)]
-    bottom = [_draw_keys(status, width)]
+    top = [_draw_title(view, width), _draw_progress(view.progress, width)]
+    bottom = [_draw_keys(view.status, width)]
     if height >= 16:
-        bottom.insert(0, _draw_footer(run_state, status, width))
+        bottom.insert(0, _draw_footer(view, width))
     if height >= 16 and (width < 72 or height < 34):
-        bottom.insert(0, panels.format_latency(run_state, width))
+        bottom.insert(0, panels.format_latency(view, width))
     columns = (
         NARROW_LAYOUT
         if width < 72
@@ -117,7 +97,7 @@ def draw_screen(
     body_height = height - len(top) - len(bottom)
     with np.errstate(all="ignore"):  # received numbers may have any size
         drawn_columns = [
-            _draw_column(run_state, column, column_width, body_height) for column in columns
+            _draw_column(view, column, column_width, body_height) for column in columns
         ]
     return [
         *(_fit_line(line, width) for line in top),
@@ -134,16 +114,14 @@ def _fit_line(line: Text, width: int) -> Text:
     return line
 
 
-def _draw_column(
-    run_state: LiveRunState, candidates: Sequence[Panel], width: int, height: int
-) -> list[Text]:
+def _draw_column(view: RunView, candidates: Sequence[Panel], width: int, height: int) -> list[Text]:
     """Draw the panels that fit into `height` lines; growing panels share the remaining lines."""
     visible: list[Panel] = []
     for panel in candidates:
         if sum(other.min_lines + 1 for other in (*visible, panel)) <= height:
             visible.append(panel)
     fixed_lines = {
-        panel.title: panel.draw(run_state, width, panel.max_lines)
+        panel.title: panel.draw(view, width, panel.max_lines)
         for panel in visible
         if not panel.is_growing
     }
@@ -164,7 +142,7 @@ def _draw_column(
     for panel in visible:
         panel_lines = fixed_lines.get(panel.title, ())
         if not 0 < len(panel_lines) <= heights[panel.title]:
-            panel_lines = panel.draw(run_state, width, heights[panel.title])
+            panel_lines = panel.draw(view, width, heights[panel.title])
         blank_count = heights[panel.title] - len(panel_lines) + is_spaced
         lines += [_draw_header(panel, width), *panel_lines, *[Text()] * blank_count]
     lines = [_fit_line(line, width) for line in lines]
@@ -194,85 +172,61 @@ def _justify(left: Text, right: Text, width: int) -> Text:
     return left.append(" " * space).append_text(right) if space > 0 else left
 
 
-def _draw_title(run_state: LiveRunState, status: SessionStatus, width: int) -> Text:
-    name = run_state.start.name if run_state.start else "no run"
-    left = Text().append(name, "bold")
-    right = _draw_state(run_state, status)
-    title = f"  {run_state.rig.title}" if run_state.rig is not None else ""
+def _draw_title(view: RunView, width: int) -> Text:
+    left, right = Text().append(view.name or "no run", "bold"), _draw_state(view.progress)
+    title = f"  {view.rig_title}" if view.rig_title else ""
     if left.cell_len + len(title) + right.cell_len < width:
         left.append(title, DIM_STYLE)
     return _justify(left, right, width)
 
 
-def describe_state(run_state: LiveRunState, status: SessionStatus) -> tuple[str, str]:
-    """Return the state of the run in words, and its style."""
-    if run_state.stop is not None:
-        style = GOOD_STYLE if run_state.stop.verdict == "complete" else BAD_STYLE
-        return f"ended: {run_state.stop.verdict}", style
-    if status.silent_s >= SILENT_S:
-        return f"no data for {format_duration(status.silent_s)}", BAD_STYLE
-    if not run_state.run:
-        return "waiting for a run", DIM_STYLE
-    state = STATE_TEXTS.get(run_state.rig_state, run_state.rig_state)
-    return state or "joined", STATE_STYLES.get(run_state.rig_state, "")
+def _draw_state(progress: Progress) -> Text:
+    style = STYLES[progress.tone]
+    if not progress.is_live:
+        return Text(progress.state, style)
+    right = Text(f"● {progress.state}", style)
+    if progress.activity:
+        right.append(f", {progress.activity}", "")
+    return right.append(f"  {format_duration(progress.time_s)}", DIM_STYLE)
 
 
-def describe_activity(run_state: LiveRunState) -> str:
-    """Return what the table is doing within the state, or "" if the state says it already."""
-    activity = LABEL_TEXTS.get(Label(run_state.position[1]), "") if run_state.recent.blocks else ""
-    return "" if activity == run_state.rig_state else activity
-
-
-def _draw_state(run_state: LiveRunState, status: SessionStatus) -> Text:
-    state, style = describe_state(run_state, status)
-    if run_state.stop is not None or status.silent_s >= SILENT_S or not run_state.run:
-        return Text(state, style)
-    right = Text(f"● {state}", style)
-    if activity := describe_activity(run_state):
-        right.append(f", {activity}", "")
-    return right.append(f"  {format_duration(run_state.index / run_state.rate_hz)}", DIM_STYLE)
-
-
-def _draw_progress(run_state: LiveRunState, width: int) -> Text:
-    """Draw step, progress of the test and planned remaining time."""
-    left = Text(_format_step(run_state, width >= 100))
-    share = run_state.progress
-    if share is None:
+def _draw_progress(progress: Progress, width: int) -> Text:
+    """Draw step, progress of the test and expected remaining time."""
+    left = Text(_format_step(progress, width >= 100))
+    if progress.progress is None or progress.left_s is None:
         return left
-    text = f" {100 * share:3.0f} %"
-    if run_state.rig_state == "holding":
+    text = f" {100 * progress.progress:3.0f} %"
+    if progress.held:
         text += "  until resumed"
-    elif run_state.stop is None:
-        remaining_s = run_state.remaining_s
-        text += f"  {format_duration(abs(remaining_s))} {'left' if remaining_s >= 0 else 'over'}"
+    elif not progress.ended:
+        time_text = format_duration(abs(progress.left_s))
+        text += f"  {time_text} {'left' if progress.left_s >= 0 else 'over'}"
     bar_width = width - left.cell_len - len(text)
     if bar_width >= 4:
-        left.append_text(draw_bar(share, bar_width, GOOD_STYLE))
+        left.append_text(draw_bar(progress.progress, bar_width, GOOD_STYLE))
     return _justify(left, Text(text), width) if bar_width < 4 else left.append(text)
 
 
-def _format_step(run_state: LiveRunState, show_cycle: bool) -> str:
+def _format_step(progress: Progress, show_cycle: bool) -> str:
     """Format the current step with a fixed width, so that the text after it does not move."""
-    step = run_state.step
-    if step is None and run_state.start and not run_state.start.steps:
-        windows = run_state.profile.plan.windows if run_state.profile else 0
-        number = run_state.position[0] + 1
-        return f"{f'window {number}/{windows}' if number else 'outside the history':<33}"
-    if step is None:
-        phase = "after" if run_state.stop else "between" if run_state.points else "before"
-        return f"{f'{phase} the steps':<33}"
-    text = f"step {step.index + 1:>2}/{run_state.step_count}  {step.frequency_hz:6.3f} Hz "
-    text += f"{ARROWS.get(step.direction, '')} {step.direction:<8}"
-    cycle_text = f"cycle {run_state.position[2] + 1}" if run_state.position[2] >= 0 else ""
-    if cycle_text and run_state.profile and isinstance(run_state.profile.excitation, Sweep):
-        cycle_text += f"/{run_state.profile.sweep.cycles}"
+    if progress.windows is not None:
+        number = progress.window
+        text = f"window {number}/{progress.windows}" if number else "outside the history"
+        return f"{text:<33}"
+    if progress.step is None:
+        return f"{f'{progress.phase} the steps':<33}"
+    text = f"step {progress.step:>2}/{progress.steps}  {progress.frequency_hz:6.3f} Hz "
+    text += f"{ARROWS.get(progress.direction, '')} {progress.direction:<8}"
+    cycle_text = f"cycle {progress.cycle}" if progress.cycle else ""
+    if cycle_text and progress.cycles:
+        cycle_text += f"/{progress.cycles}"
     return f"{text:<33}" + (f"  {cycle_text:<13}" if show_cycle else "")
 
 
-def _draw_footer(run_state: LiveRunState, status: SessionStatus, width: int) -> Text:
+def _draw_footer(view: RunView, width: int) -> Text:
     """Draw one line with the connected components and the gaps of the recording."""
-    gaps = panels.format_gaps(run_state)
-    components = panels.format_components(run_state, status, width - gaps.cell_len - 12)
+    gaps = panels.format_gaps(view)
+    components = panels.format_components(view, width - gaps.cell_len - 12)
     return _justify(Text("connected  ", DIM_STYLE).append_text(components), gaps, width)
 
 

@@ -105,9 +105,9 @@ def serve_page(
         while not should_stop():
             client.listen(FRAME_S)
             feed.role = client.role
-            feed.publish(build_sections(client.run_state, client.session_status()))
+            feed.publish(build_sections(client.view()))
         client.listen(FINAL_FRAMES_S)
-        feed.publish(build_sections(client.run_state, client.session_status()))
+        feed.publish(build_sections(client.view()))
         link.close()
     finally:
         feed.close()

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import ClassVar
 
 import numpy as np
@@ -11,6 +12,7 @@ from table_io.block import Float1D, Float2D
 from table_io.config.excitation.orbit_plan import OrbitPlan
 from table_io.records import JumpForecast, OrbitPoint, PrcPoint
 from twin.viewer.style import PLUM, PRC_COLOURS, VIOLET, Rgb
+from twin.viewer.view_model import list_orbit_curves, list_prc_curves
 
 PRC_WIDTH, PLANE_WIDTH = 2.9, 1.5  # relative to a height of 1
 
@@ -105,73 +107,53 @@ class AxisRange:
         return self.value != previous
 
 
-class PrcCurves:
-    """PRC points so far: eta_d over frequency."""
+class FrequencyCurves:
+    """Curves over frequency so far: eta_d of the PRC, or amplitudes of orbits in mm over a plan."""
 
-    def __init__(self, low_hz: float, high_hz: float) -> None:
+    def __init__(self, low_hz: float, high_hz: float, orbit_plan: OrbitPlan | None = None) -> None:
+        self._orbit_plan = orbit_plan
+        self._points: dict[int, PrcPoint] = {}
+        self._orbits: dict[int, OrbitPoint] = {}
+        self._highest = 0.1
+        if orbit_plan is not None:
+            frequencies_hz = [orbit.frequency_hz for orbit in orbit_plan.points]
+            low_hz, high_hz = min(frequencies_hz), max(frequencies_hz)
+            highest_mm = 1e3 * max(orbit.amplitude_m for orbit in orbit_plan.points)
+            self._highest = nice_ceil(1.1 * highest_mm)
         margin = max(0.03 * (high_hz - low_hz), 0.05)
-        self._frequency_range = (low_hz - margin, high_hz + margin)
-        self._points: dict[tuple[int, int], PrcPoint] = {}
-        self._max_eta_d = 0.1
+        self._frequency_range = low_hz - margin, high_hz + margin
 
     @property
     def axes(self) -> PlotAxes:
-        return PlotAxes(
-            self._frequency_range, (0.0, self._max_eta_d), "f [Hz]", "η_d [-]", PRC_WIDTH
-        )
+        label = "η_d [-]" if self._orbit_plan is None else "amplitude of u [mm]"
+        return PlotAxes(self._frequency_range, (0.0, self._highest), "f [Hz]", label, PRC_WIDTH)
 
-    def add(self, point: PrcPoint) -> None:
-        """Add a point and extend the axes."""
-        self._points[point.index, point.step] = point  # a repeated point counts once
-        etas = [values.eta_d for values in (point.measured, point.twin) if values is not None]
-        highest = max((eta for eta in etas if math.isfinite(eta)), default=0.0)
-        if highest > self._max_eta_d:
-            self._max_eta_d = nice_ceil(1.1 * highest)
-
-    def get_curves(self, source: str) -> list[tuple[Rgb, Float2D]]:
-        """Return (color, (point, 2) in Hz and eta_d) of each direction that has points."""
-        curves = []
-        for direction, colour in zip(("forward", "backward"), PRC_COLOURS[source], strict=True):
-            rows = [
-                (point.frequency_hz, quantities.eta_d)
-                for point in self._points.values()
-                if point.direction == direction
-                and (quantities := getattr(point, source)) is not None
-            ]
-            curve = np.array(rows, dtype=np.float64).reshape(-1, 2)
-            curve = curve[np.isfinite(curve).all(axis=1)]
-            if len(curve):
-                curves.append((colour, curve))
-        return curves
-
-
-class OrbitCurves:
-    """Orbits of a continuation so far: amplitude of u in mm over frequency, over the planned."""
-
-    def __init__(self, plan: OrbitPlan) -> None:
-        self._planned = np.array([[o.frequency_hz, 1e3 * o.amplitude_m] for o in plan.points])
-        self._measured: dict[int, tuple[float, float]] = {}
-        low_hz, high_hz = self._planned[:, 0].min(), self._planned[:, 0].max()
-        margin = max(0.03 * (high_hz - low_hz), 0.05)
-        self._frequency_range = (float(low_hz - margin), float(high_hz + margin))
-        self._max_mm = nice_ceil(1.1 * float(self._planned[:, 1].max()))
-
-    @property
-    def axes(self) -> PlotAxes:
-        return PlotAxes(
-            self._frequency_range, (0.0, self._max_mm), "f [Hz]", "amplitude of u [mm]", PRC_WIDTH
-        )
-
-    def add(self, orbit: OrbitPoint) -> None:
-        """Add an accepted orbit; one measured again replaces the earlier."""
-        if orbit.accepted:
-            self._measured[orbit.step] = orbit.frequency_hz, 1e3 * orbit.amplitude_m
+    def add(self, point: PrcPoint | OrbitPoint) -> None:
+        """Add a point or an accepted orbit and extend the axes; one measured again replaces it."""
+        if isinstance(point, PrcPoint):
+            self._points[point.step] = point
+            etas = [values.eta_d for values in (point.measured, point.twin) if values is not None]
+            highest = max((eta for eta in etas if math.isfinite(eta)), default=0.0)
+            if highest > self._highest and self._orbit_plan is None:
+                self._highest = nice_ceil(1.1 * highest)
+        elif point.accepted:
+            self._orbits[point.step] = point
 
     def get_curves(self, source: str) -> list[tuple[Rgb, Float2D]]:
-        """Return (color, (orbit, 2) in Hz and mm) of the plan ("twin") or of what is "measured"."""
-        measured = np.array([self._measured[step] for step in sorted(self._measured)])
-        curve = self._planned if source == "twin" else measured.reshape(-1, 2)
-        return [(PRC_COLOURS[source][0], curve)] if len(curve) else []
+        """Return (color, (point, 2) in Hz and shown values) of the curves "measured" or "twin"."""
+        if self._orbit_plan is None:
+            curves = list_prc_curves(self._points.values(), attrgetter("eta_d"))
+        else:
+            orbits = (self._orbits[step] for step in sorted(self._orbits))
+            curves = list_orbit_curves(self._orbit_plan, orbits)
+        strips = []
+        for curve in curves:
+            if (curve.source == "twin") == (source == "twin"):
+                strip = np.array(curve.points, dtype=np.float64).reshape(-1, 2)
+                strip = strip[np.isfinite(strip).all(axis=1)]
+                if len(strip):
+                    strips.append((PRC_COLOURS[source][curve.direction == "backward"], strip))
+        return strips
 
 
 def forecast_lines(axes: PlotAxes, forecast: JumpForecast) -> list[tuple[Rgb, Float2D]]:

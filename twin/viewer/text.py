@@ -1,17 +1,15 @@
 """Texts and derived values of the view: status, forecast, agreement, cycle and PRC point."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 
 from table_io.block import Block, Float2D, Label
 from table_io.records import (
     LABEL_TEXTS,
-    Agreement,
     Comparison,
     CycleExtremes,
-    Estimate,
     Extremes,
     JumpForecast,
     NormalizedResponse,
@@ -21,6 +19,7 @@ from table_io.records import (
 from table_io.units import GRAVITY_M_S2
 from twin.viewer.model_branches import FoldAhead
 from twin.viewer.style import CHANNEL_LINES
+from twin.viewer.view_model import ParameterRow, TwinRow
 
 
 class SweepPosition:
@@ -117,53 +116,38 @@ def _format_jump(forecast: JumpForecast) -> str:
     )
 
 
-def disagreement_ratios(agreement: Agreement) -> dict[str, float]:
+def disagreement_ratios(rows: Iterable[TwinRow]) -> dict[str, float]:
     """Return error / band by line name: u, a, and the worse load cell of each side."""
     ratios: dict[str, float] = {}
-    for name, error, band in zip(agreement.channels, agreement.error, agreement.band, strict=True):
-        line = CHANNEL_LINES.get(name, name)
-        if line and band > 0 and not error / band <= ratios.get(line, -1.0):
-            ratios[line] = error / band
+    for row in rows:
+        line = CHANNEL_LINES.get(row.channel, row.channel)
+        if line and row.band > 0 and not row.share_of_band <= ratios.get(line, -1.0):
+            ratios[line] = row.share_of_band
     return ratios
 
 
-def format_agreement(agreement: Agreement) -> str:
+def format_agreement(rows: Iterable[TwinRow]) -> str:
     """Format error, band and regime of the largest error per channel as Markdown, worst first."""
     phases = ("in flight", "contact right", "contact left")
     lines: list[tuple[float, str]] = []
-    for name, error, band, *parts in zip(
-        agreement.channels,
-        agreement.error,
-        agreement.band,
-        agreement.flight,
-        agreement.right,
-        agreement.left,
-        strict=True,
-    ):
-        known = [part for part in zip(parts, phases, strict=True) if math.isfinite(part[0])]
+    for row in rows:
+        known = [part for part in zip(row.phases, phases, strict=True) if math.isfinite(part[0])]
         worst_phase = max(known)[1] if known else "-"
-        share = error / band if band > 0 else math.nan
-        line = f"| {name} | {error:.3g} | {band:.3g} | {share:.2f} | {worst_phase} |"
+        share = row.share_of_band
+        line = f"| {row.channel} | {row.error:.3g} | {row.band:.3g} | {share:.2f} | {worst_phase} |"
         lines.append((-share if math.isfinite(share) else math.inf, line))
     head = "| SI, rms | error | band | error / band | largest |\n|---|---|---|---|---|\n"
     return head + "\n".join(line for _, line in sorted(lines))
 
 
-def parameter_drifts(estimate: Estimate) -> Iterator[tuple[str, Float2D]]:
-    """Yield (parameter, (1, 3)): drift since the start and its bounds at plus and minus 2 sd.
+def drift_interval(row: ParameterRow) -> Float2D:
+    """Return the drift since the start and its bounds at plus and minus 2 sd, (1, 3).
 
-    Gaps in mm, other parameters in % of their first value.
+    Of a gap in mm, of other parameters in % of their first value.
     """
-    rows = zip(estimate.names, estimate.values, estimate.drift, estimate.drift_sd, strict=True)
-    for name, value, drift, sd in rows:
-        first = abs(value - drift)
-        scale = 1e3 if is_length(name) else 100 / first if first > 0 else math.nan
-        yield name, scale * np.array([[drift, drift + 2 * sd, drift - 2 * sd]])
-
-
-def is_length(parameter: str) -> bool:
-    """Return True for a gap, whose first value may be 0."""
-    return parameter.startswith("gap")
+    scale = 1e3 if row.is_length else 100 / row.drift_size
+    bounds = row.drift + 2 * row.drift_sd, row.drift - 2 * row.drift_sd
+    return scale * np.array([[row.drift, *bounds]])
 
 
 RATIO_SYMBOLS = (("eta_d", "η_d"), ("eta_a", "η_a"), ("eta_r", "η_R"), ("eta_l", "η_L"),

@@ -32,11 +32,10 @@ from table_io.records import (
 from twin.recording.reader import Recording
 from twin.viewer.address import viewer_url
 from twin.viewer.blueprint import log_static, make_blueprint
-from twin.viewer.levels import ReferenceLevels
 from twin.viewer.model_branches import FoldAhead, ModelBranches
 from twin.viewer.motion import BlockMotion, extract_motion, extract_track
-from twin.viewer.phase_plane import DAMPER_LOOP, PHASE_PLANE, PlanePlot
-from twin.viewer.plots import OrbitCurves, PrcCurves, forecast_lines
+from twin.viewer.plots import FrequencyCurves, forecast_lines
+from twin.viewer.scaled_plots import DAMPER_LOOP, PHASE_PLANE, PlanePlot, ReferenceLevels
 from twin.viewer.scene import Scene
 from twin.viewer.sink import RerunSink, escape_path_part
 from twin.viewer.style import LineStyle, disagreement_style, drift_styles
@@ -44,15 +43,15 @@ from twin.viewer.text import (
     RelativeError,
     SweepPosition,
     disagreement_ratios,
+    drift_interval,
     format_agreement,
     format_cycle,
     format_forecast,
     format_point,
     format_status,
     impact_counts,
-    is_length,
-    parameter_drifts,
 )
+from twin.viewer.view_model import list_drift_rows, list_twin_rows
 
 BATCH_ITEMS = 1000  # items of a log per call of `feed`
 LINE_RATE_HZ = 500  # of the lines over time, at most; all samples would be 25 MB a minute at 2 kHz
@@ -75,9 +74,8 @@ class RerunView:
         self._styled: set[str] = set()
         self._logged: set[tuple[int, str, str]] = set()
         self._sweep_position = SweepPosition()
-        self._prc = PrcCurves(profile.plan.low_hz, profile.plan.high_hz)
-        continuation = profile.continuation
-        self._orbits = None if continuation is None else OrbitCurves(continuation.orbit_plan)
+        orbit_plan = profile.continuation.orbit_plan if profile.continuation else None
+        self._curves = FrequencyCurves(profile.plan.low_hz, profile.plan.high_hz, orbit_plan)
         self._errors = RelativeError(start.rate_hz)
         self._sink = RerunSink(start, save, serve, make_blueprint(start, self._scene, bool(serve)))
         self.url = viewer_url(serve) if serve else ""
@@ -97,11 +95,6 @@ class RerunView:
         self._fold: FoldAhead | None = None
         for entity in ("ahead", "warning"):
             self._sink.send_document(entity, 0, "none so far")
-
-    @property
-    def _curves(self) -> PrcCurves | OrbitCurves:
-        """Curves of the plot over frequency."""
-        return self._prc if self._orbits is None else self._orbits
 
     def feed(self, items: Sequence[Block | Record]) -> None:
         """Draw a batch of items; call about every 100 ms in a live run."""
@@ -215,15 +208,18 @@ class RerunView:
                 )
             case Agreement():
                 self._sink.send_scalars("disagreement/band", [item.index], [1.0])
-                for name, ratio in disagreement_ratios(item).items():
+                rows = list_twin_rows(item)
+                for name, ratio in disagreement_ratios(rows).items():
                     self._styled_scalars(
                         "disagreement", name, disagreement_style, item.index, [ratio]
                     )
-                self._sink.send_document("agreement", item.index, format_agreement(item))
+                self._sink.send_document("agreement", item.index, format_agreement(rows))
             case Estimate():
-                for name, change in parameter_drifts(item):
-                    entity = "gaps" if is_length(name) else "drift"
-                    self._styled_scalars(entity, name, drift_styles, item.index, change)
+                for row in list_drift_rows(item):
+                    entity = "gaps" if row.is_length else "drift"
+                    self._styled_scalars(
+                        entity, row.name, drift_styles, item.index, drift_interval(row)
+                    )
             case JumpForecast():
                 marks = forecast_lines(self._curves.axes, item)
                 self._sink.send_coloured_strips("prc/ahead", item.index, marks)
@@ -264,14 +260,12 @@ class RerunView:
 
     def _draw_point(self, point: PrcPoint | OrbitPoint) -> None:
         """Draw the PRC so far, or the orbits over the planned ones, and the newest point."""
+        self._curves.add(point)
         if isinstance(point, PrcPoint):
-            self._prc.add(point)
             self._sink.send_document("point", point.index, format_point(point))
             if self._branches is not None:
                 self._fold = self._branches.find_fold(point)
         else:
-            if self._orbits is not None:
-                self._orbits.add(point)
             self._log_event(point)
         self._draw_curves(point.index)
 

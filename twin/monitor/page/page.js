@@ -133,7 +133,8 @@ function drawHeader(stale) {
   document.title = `${s.state} · ${run.name || "shaketwin"}`;
   stale ? setState("page disconnected", "bad") : setState(s.state, s.tone);
   $("activity").textContent = s.ended ? s.reason : s.activity;
-  $("step").textContent = s.step === null ? (s.ended ? "test over" : "no step in progress")
+  $("step").textContent = s.windows !== null ? (s.window ? `window ${s.window}/${s.windows}` : "outside the history")
+    : s.step === null ? (s.ended ? "test over" : "no step in progress")
     : `step ${s.step}/${s.steps} · ${digits(s.frequency_hz, 4)} Hz ${s.direction === "forward" ? "↑" : "↓"} ${s.direction}`
       + (s.cycle ? ` · cycle ${s.cycle}${s.cycles ? "/" + s.cycles : ""}` : "");
   const left = s.ended || s.left_s === null ? "" : s.held ? "held until resumed"
@@ -146,18 +147,17 @@ function drawHeader(stale) {
 function drawLevel() {
   const l = state.level, has = known(l.demanded_g);
   $("level").textContent = has && known(l.current_g) ? `${l.current_g.toFixed(4)} g` : "–";
-  const share = has && known(l.current_g) ? l.current_g / l.demanded_g - 1 : null;
+  const share = known(l.deviation) ? l.deviation : null;
   $("deviation").textContent = share === null ? (has ? "not steady yet" : "no step in progress") : signed(100 * share, "%");
-  $("deviation").className = share === null ? "dim" : Math.abs(share) <= l.tolerance ? "good" : Math.abs(share) <= l.alarm ? "warn" : "bad";
+  $("deviation").className = share === null ? "dim" : l.tone;
   $("level-note").textContent = !has ? "" : `demanded ${l.demanded_g.toFixed(4)} g`
     + (known(l.accepted) ? `, ${l.accepted ? "accepted" : "being tuned"}, corrected ${l.updates} ×` : "");
   drawLevelScale(has ? l : null, share);
 }
 
 function drawMargins() {
-  const { rows, warn, alarm } = state.margins;
-  $("margins").replaceChildren(...rows.map((row) => {
-    const tone = row.share === null || row.share > alarm ? "bad" : row.share > warn ? "warn" : "good";
+  $("margins").replaceChildren(...state.margins.rows.map((row) => {
+    const { tone } = row;
     const fill = element("i", "");
     fill.style.width = `${100 * Math.min(row.share ?? 0, 1)}%`;
     return element("div", "margin", element("span", "", row.name), element("span", `bar ${tone}`, fill),
@@ -181,7 +181,7 @@ function drawTwin() {
 }
 
 function drawTiming() {
-  drawTable("timing", state.timing.rows.map((row) => [[row.component], [digits(row.p50)], [digits(row.p99)], [digits(row.max)],
+  drawTable("timing", state.timing.rows.map((row) => [[row.component], [digits(row.p50_ms)], [digits(row.p99_ms)], [digits(row.max_ms)],
     [row.missed, row.missed ? "warn" : ""]]));
   const { dropouts, components } = state.state;
   $("dropouts").textContent = `${dropouts} dropouts; connected: ${components.join(", ") || "none"}`;
