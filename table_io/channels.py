@@ -12,6 +12,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D
 
+TIME_COLUMN = "time_s"  # of samples in a table, next to the channels
 DIRECTION_SIGNS = {"right": 1.0, "compression": 1.0, "left": -1.0, "tension": -1.0}
 
 

@@ -11,7 +11,7 @@ from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
 from tests.recording.example_run import BLOCK_SAMPLES, START, block, run, write
 from twin.cli.main import app
-from twin.exchange.export import export_log
+from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import PARTS_FOLDER, resolve_log_path
@@ -96,7 +96,7 @@ def test_parts_alone_are_no_log_yet(tmp_path: Path) -> None:
     for reader in (
         resolve_log_path,
         open_log,
-        lambda place: export_log(place, ["csv"], None, (), None),
+        lambda place: export_log(ExportOptions(place, ("csv",))),
     ):
         with pytest.raises(InputError) as caught:
             reader(folder)

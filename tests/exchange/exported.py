@@ -9,7 +9,7 @@ from table_io.block import Block
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Event, NormalizedResponse, PrcPoint, SampleGap
 from tests.reports.recordings import blocks, start_record
-from twin.exchange.export import export_log
+from twin.exchange.export import ExportOptions, export_log
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording
 from twin.transport.codec import Item
@@ -46,7 +46,7 @@ def export_formats(folder: Path, kinds: tuple[str, ...]) -> tuple[Path, Path]:
     written = items()
     mixed = [*written[9:], *written[:9], written[4]]  # out of order, and one of them twice
     write_items(path, [start, *mixed], start)
-    assert export_log(path, [*kinds], base, (), None) == 0
+    export_log(ExportOptions(path, kinds, base))
     return path, base
 
 

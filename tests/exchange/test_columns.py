@@ -7,10 +7,10 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.errors import InputError
+from table_io.formats.table import ForeignTable, make_column
+from table_io.formats.timing import find_holes
 from tests.input_errors import raises_input_error
 from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
-from twin.exchange.formats import SampleTable, make_column
-from twin.exchange.sampling import find_holes
 
 TIME = np.arange(400) / 200.0
 
@@ -23,7 +23,7 @@ def import_columns(folder: Path, card: str | None = None, **columns: Float1D) ->
     file = folder / "table.csv"
     file.touch()
     held = {name: make_column(values) for name, values in columns.items()}
-    table = SampleTable(file, held, first_row=2)
+    table = ForeignTable(file, "a table", held, first_row=2)
     return read_samples(table, read_column_map(path if card is not None else None))
 
 
@@ -71,7 +71,10 @@ def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
         ("[columns]\nrel_disp_m = {column = 'b', gain = 0.0}", ["gain is 0"]),
         ("[columns]\nrel_disp_m = {colum = 'b'}", ["did you mean 'column'?"]),
         ("[columns]\nrel_disp_m = {column = 'bb'}", ["no column 'bb'", "did you mean 'b'?"]),
-        ("rate_hz = 5.0\n[columns]\ntime_s = {column = 't'}", ["keep one"]),
+        (
+            "rate_hz = 5.0\n[columns]\ntime_s = {column = 't'}\nrel_disp_m = {column = 'b'}",
+            ["rate_hz = 5.0", "200 Hz"],
+        ),
         ("[columns]\nrel_disp_m = {column = 'b'}", ["no column time_s", "rate_hz"]),
         ("rate_hz = 5.0", ["no channel in it"]),
         (

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 
 from table_io.errors import InputError
+from table_io.formats import read_table
+from table_io.formats.table import ForeignTable
+from table_io.formats.text import MAX_LINE_CHARS
 from tests.input_errors import raises_input_error
-from twin.exchange.formats import SampleTable, read_table
-from twin.exchange.formats.csv import MAX_LINE_CHARS
 
 GOOD = "time_s,table_acc_m_s2\n0,1.5\n0.1,-2e-3\n0.2,3\n"
 
 
-def read(folder: Path, content: str | bytes) -> SampleTable:
+def read(folder: Path, content: str | bytes) -> ForeignTable:
     path = folder / "table.csv"
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return read_table(path)
@@ -62,11 +63,8 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path: Path) -> None:
     [
         ("", ["empty"]),
         ("  \n\n", ["empty"]),
-        (b"\x89PNG\r\n\x1a\n\0\0", ["binary"]),
-        (b"a,b\n1,\xff\n", ["not UTF-8"]),
+        (b"\x89PNG\r\n\x1a\n\0\0", ["a PNG image"]),
         ("a,b\n", ["no samples"]),
-        ("a,,c\n1,2,3\n", ["row 1", "column 2", "no name"]),
-        ("a,b,a\n1,2,3\n", ["row 1", "a more than once"]),
         ("a,b\n1,2\n3\n", ["row 3", "1 cells", "2 columns"]),
         ("a,b\n1,2\n3,4,5\n", ["row 3", "3 cells"]),
         ("a,b\n1,2,3,4\n", ["row 2", "decimal commas"]),
@@ -75,8 +73,6 @@ def test_an_empty_cell_is_a_lost_sample(tmp_path: Path) -> None:
         ("a,b\ns,mm\n1,2\nx,3\n", ["row 4", "column 'a'", "'x'"]),
         ("t u\n0 1\n1 2\n2 3 4\n", ["row 4", "3 cells", "2 columns"]),
         ("a,b\n1,2\n3,N/A\n", ["row 3", "column 'b'", "leave a lost sample empty"]),
-        ("a,b\n1,2\n3,inf\n", ["row 3", "column 'b'", "infinite"]),
-        ("a,b\n1,2\n\n3,4\n", ["row 3 is empty"]),
         ('a,b\n1,"2\n' + "3,4\n" * 50_000, ["row 2", "quote"]),
         ("a,b\n" + "1" * (MAX_LINE_CHARS + 5), ["line of more than"]),
     ],

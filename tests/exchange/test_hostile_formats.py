@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
+from table_io import formats
 from table_io.errors import InputError
+from table_io.formats import read_table, sandbox
 from tests.exchange.test_formats import uff
 from tests.input_errors import raises_input_error
-from twin.exchange import formats
 from twin.exchange.columns import ColumnMap, read_samples
-from twin.exchange.formats import read_table, sandbox
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")
@@ -83,7 +83,7 @@ HOSTILE: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "mat bomb": ("a.mat", packed_bomb, "200 times its size"),
     "pickle": ("a.npz", lambda p: np.savez(p, u=np.array([{}] * N, object)), "objects"),
     "strings": ("a.parquet", lambda p: pq.write_table(pa.table({"u": ["1"] * N}), p), "string"),
-    "another format": ("a.tdms", lambda p: p.write_bytes(b"a,b\n1,2\n"), "no column of num"),
+    "another format": ("a.tdms", lambda p: p.write_bytes(b"a,b\n1,2\n"), "not a LabVIEW TDMS file"),
     "nothing": ("a.mat", lambda p: p.write_bytes(b""), "damaged"),
     "fewer values": ("a.uff", fewer, "500 values and has 400"),
     "no 58": ("a.uff", lambda p: p.write_text("    -1\n   151\nx\n    -1\n"), "no set of type 58"),
@@ -110,6 +110,7 @@ def test_a_library_that_is_not_there_is_named(
         raise ModuleNotFoundError("No module named 'h5py'", name="h5py")
 
     monkeypatch.setattr(formats, "import_module", absent)
+    (tmp_path / "a.h5").touch()
     with raises_input_error(where=tmp_path / "a.h5", problem="h5py", remedy='"shaketwin[formats]"'):
         read_table(tmp_path / "a.h5")
 

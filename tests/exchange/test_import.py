@@ -13,7 +13,7 @@ from tests.exchange.csv_tables import write_csv
 from tests.input_errors import raises_input_error
 from tests.run.test_unpaced import QUICK, play_run
 from twin.cli.report import print_recording_prc
-from twin.exchange.export import export_log
+from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import import_samples, print_contents
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
@@ -184,7 +184,7 @@ def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path
 def test_our_own_export_is_the_same_run_again(
     run: tuple[Path, Recording], tmp_path: Path, draft: None
 ) -> None:
-    assert export_log(run[1].path, ["parquet"], tmp_path / "out", (), None) == 0
+    export_log(ExportOptions(run[1].path, ("parquet",), tmp_path / "out"))
     assert import_samples(tmp_path / "out.parquet", tmp_path / "again.mcap", None, None, None) == 0
     again = read_recording(tmp_path / "again.mcap")
     assert whole(again).is_identical(whole(run[1]))
@@ -201,7 +201,7 @@ def test_a_table_without_a_profile_says_so_and_has_its_curve(
     run: tuple[Path, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Its labels tell how many cycles were held and measured, 6 and 2 here."""
-    assert export_log(run[1].path, ["csv"], tmp_path / "out", (), None) == 0
+    export_log(ExportOptions(run[1].path, ("csv",), tmp_path / "out"))
     assert import_samples(tmp_path / "out.csv", tmp_path / "bare.mcap", None, None, None) == 0
     bare = read_recording(tmp_path / "bare.mcap")
     assert len(bare.records(PrcPoint)) == len(run[1].start.steps)
@@ -217,7 +217,11 @@ def test_labels_of_a_table_stand_before_what_its_motion_tells(
     run: tuple[Path, Recording], tmp_path: Path
 ) -> None:
     """One that is not all of them is none."""
-    assert export_log(run[1].path, ["csv"], tmp_path / "out", ("table_acc_m_s2",), (1, 2)) == 0
+    export_log(
+        ExportOptions(
+            run[1].path, ("csv",), tmp_path / "out", channels=("table_acc_m_s2",), steps=(1, 2)
+        )
+    )
     import_samples(tmp_path / "out.csv", tmp_path / "a.mcap", run[0] / "quick.toml", None, None)
     steps = read_recording(tmp_path / "a.mcap").start.steps
     assert [step.frequency_hz for step in steps] == [

@@ -7,10 +7,10 @@ import pytest
 
 from table_io.block import Float1D, Label
 from table_io.errors import InputError
+from table_io.formats.table import ForeignTable, make_column
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
 from twin.exchange.columns import read_column_map
-from twin.exchange.formats import SampleTable, make_column
 from twin.exchange.import_table import ImportOptions, import_samples
 from twin.exchange.proposal import MapProposal, propose_map
 from twin.recording.reader import read_recording
@@ -27,7 +27,7 @@ def propose(
     held = {
         name: make_column(values, (units or {}).get(name, "")) for name, values in columns.items()
     }
-    return propose_map(SampleTable(Path("table.csv"), held, facts=facts))
+    return propose_map(ForeignTable(Path("table.csv"), "a table", held, facts=facts))
 
 
 def sources(proposal: MapProposal) -> dict[str, tuple[str, str]]:

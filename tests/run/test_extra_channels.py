@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from table_io.formats import read_table
 from table_io.records import Comparison
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.viewer.example_run import scalars
 from twin.cli.main import app
 from twin.compare import COMPARED_CHANNELS
-from twin.exchange.formats import read_table
 from twin.exchange.import_table import import_samples
 from twin.log import open_log
 from twin.monitor.panels import draw_limits, draw_twin, format_gaps

@@ -20,7 +20,7 @@ from table_io.records import Check, Event, Level, PrcPoint, RunStop, Trip
 from tests.replay.in_memory import recorded_in
 from tests.table_io.excitation.pulse_train import PulseTrain
 from twin.cli.simulate import simulate_profile
-from twin.exchange.export import export_log
+from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import import_samples
 from twin.live.run_command import run_test
 from twin.recording.reader import Recording, read_recording
@@ -294,7 +294,7 @@ def test_the_model_alone_plays_the_record(tmp_path: Path, draft: None) -> None:
 def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Path) -> None:
     _, recording, summary = run
     table = tmp_path / f"samples.{kind}"
-    assert export_log(recording.path, [kind], tmp_path / "samples", (), None) == 0
+    export_log(ExportOptions(recording.path, (kind,), tmp_path / "samples"))
     assert import_samples(table, tmp_path / "back.mcap", None, None, None) == 0
     back = read_recording(tmp_path / "back.mcap")
     assert back.start.steps == ()

@@ -9,7 +9,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import PredictionHash
-from twin.exchange.export import export_log
+from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
 from twin.recording.log_metadata import select_recorded
 from twin.recording.mcap_log import write_items
@@ -100,7 +100,11 @@ def test_the_log_and_exports_have_all_predictions(
     logs = [open_log(path) for path in (sparse_log, log_file)]
     assert logs[0].predicted.tobytes() == logs[1].predicted.tobytes()
     for path, name in ((sparse_log, "sparse"), (log_file, "all")):
-        export_log(path, ["csv"], tmp_path / name, ("twin_free_rel_disp_m",), (2, 2))
+        export_log(
+            ExportOptions(
+                path, ("csv",), tmp_path / name, channels=("twin_free_rel_disp_m",), steps=(2, 2)
+            )
+        )
     texts = [(tmp_path / f"{name}.csv").read_text().splitlines() for name in ("sparse", "all")]
     assert texts[0][-500:] == texts[1][-500:]
 

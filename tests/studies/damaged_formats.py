@@ -17,9 +17,9 @@ from tempfile import TemporaryDirectory
 from time import process_time
 
 from table_io.errors import InputError
+from table_io.formats import read_table
 from tests.exchange.test_formats import FORMATS
 from twin.exchange.columns import ColumnMap, read_samples
-from twin.exchange.formats import read_table
 
 HEAD_BYTES = 4000  # bytes in which half of the changes lie: there stands what a file says of itself
 ODD = (0, 0x7F, 0x80, 0xFF)

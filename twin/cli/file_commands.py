@@ -184,7 +184,8 @@ def export_command(
     steps: StepsOption = None,
 ) -> None:
     """Export measurement and twin of a log for other tools, in several formats at once."""
-    from twin.exchange.export import export_log
+    from twin.exchange.export import ExportOptions, export_log
+    from twin.system.terminal import error_console, print_line
 
     requested = {"csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd}
     formats = [kind for kind, wanted in requested.items() if wanted]
@@ -193,4 +194,16 @@ def export_command(
         from twin.recording.tabular import parse_step_range
 
         step_span = parse_step_range(steps)
-    raise typer.Exit(export_log(log, formats, out, tuple(channel or ()), step_span))
+    exported = export_log(ExportOptions(log, tuple(formats), out, tuple(channel or ()), step_span))
+    if not exported.is_intact:
+        error_console.print(
+            f"warning: {log} is unfinished or has invalid items; "
+            f"`shaketwin verify {log}` lists what is missing",
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+    for path in exported.files:
+        has_rows = path.suffix not in (".rrd", ".json")
+        size = f"{exported.rows} rows of {exported.columns} columns -> " if has_rows else ""
+        print_line(f"{size}{path}")

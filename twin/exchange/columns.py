@@ -10,28 +10,30 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, field_validator
 
 from table_io.block import Float1D, Int1D
 from table_io.channels import (
     CHANNEL_BY_NAME,
     RELATIVE_DISP,
     RELATIVE_DISP_SOURCES,
+    TIME_COLUMN,
     Channel,
 )
 from table_io.config.base import ConfigModel, Finite, Positive, load_config
 from table_io.errors import InputError, suggest
+from table_io.formats import MAX_LISTED_COLUMNS
+from table_io.formats.table import ForeignTable
+from table_io.formats.timing import resolve_times
+from table_io.formats.words import TIME_UNITS, normalize_unit
 from table_io.units import UNITS
-from twin.exchange.formats import MAX_LISTED_COLUMNS, SampleTable, check_size
-from twin.exchange.formats.layout import TIME_UNITS, normalize_unit
 from twin.exchange.integration import (
     EXTERNAL_FORCE,
     convert_external_force,
     integrate_accelerations,
 )
 from twin.exchange.plausibility import list_implausible
-from twin.exchange.sampling import fit_uniform_rate, resolve_stated_rate
-from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
 
 
 class ColumnSource(ConfigModel):
@@ -89,15 +91,6 @@ class ColumnMap(ConfigModel):
         None, description="Band in which rel_disp_m is integrated from the accelerations."
     )
     columns: dict[str, ColumnSource] = Field(default_factory=dict)
-
-    @field_validator("columns")
-    @classmethod
-    def _check_columns(
-        cls, columns: dict[str, ColumnSource], info: ValidationInfo
-    ) -> dict[str, ColumnSource]:
-        if TIME_COLUMN in columns and info.data.get("rate_hz") is not None:
-            raise ValueError(f"{TIME_COLUMN} and rate_hz both state the sampling times; keep one")
-        return columns
 
     @field_validator("integrate_hz")
     @classmethod
@@ -169,7 +162,7 @@ class ImportedSamples:
 
 
 def read_samples(
-    table: SampleTable,
+    table: ForeignTable,
     column_map: ColumnMap | None,
     known: ImportColumns = CANONICAL_COLUMNS,
     *,
@@ -186,42 +179,42 @@ def read_samples(
     sources, notes = _select_columns(table, column_map, known, leave_out)
     for name, column in sources.items():
         _check_unit(table, name, column, known.recorded_unit(name))
-    _check_lengths(table, sources)
+    table.check_size([source.column for source in sources.values()])
+    infos = [table.columns[source.column] for source in sources.values()]
+    size, length_notes = _find_common_size(table, sources)
+    notes += length_notes
     values = {
-        name: column.to_si(name, table.read_column(column.column), known.unit_factors(name))
-        for name, column in sources.items()
+        name: source.to_si(name, table.read_column(source.column)[:size], known.unit_factors(name))
+        for name, source in sources.items()
     }
     if _is_derived_disp(values):  # of an export of ours
         del values[RELATIVE_DISP]
         notes.append(f"left out: {RELATIVE_DISP}; it is the difference of two other channels")
-    time = values.pop(TIME_COLUMN, _read_file_time(table, sources, column_map))
+    stated_hz = column_map.rate_hz if column_map is not None else None
+    time = values.pop(TIME_COLUMN, None)
+    if time is None:
+        time = _read_clock(table, sources, size)
+    rate, index, rate_notes = resolve_times(time, table, infos, stated_hz)
     if column_map is not None and (column_map.from_s, column_map.to_s) != (None, None):
-        rows, note = _select_rows(table, sources, column_map, time)
+        times = time if time is not None else infos[0].start_s + index / rate
+        rows, note = _select_rows(table, column_map, times)
         values = {name: column[rows] for name, column in values.items()}
-        time = None if time is None else time[rows]
+        rate, index, rate_notes = resolve_times(
+            times[rows] if time is not None else None, table, infos, stated_hz
+        )
+        index = index[: rows.stop - rows.start]
         notes.append(note)
     force = values.pop(EXTERNAL_FORCE, None)
-    order = [name for name in known.channels if name in values]
-    channels = {name: values[name] for name in order}
+    channels = {name: values[name] for name in known.channels if name in values}
     if force is not None:
         mass_kg = column_map.mass_kg if column_map is not None else None
         channels |= convert_external_force(channels, force, mass_kg)
-        order = [name for name in known.channels if name in channels]
-        channels = {name: channels[name] for name in order}
+        channels = {name: channels[name] for name in known.channels if name in channels}
         notes.append(f"{EXTERNAL_FORCE} on the mass is recorded as a table acceleration, -F / M")
-    if time is not None:
-        rate, index, rate_notes = fit_uniform_rate(time, table)
-        notes += rate_notes
-    else:
-        infos = [table.columns[column.column] for column in sources.values()]
-        rate, rate_notes = resolve_stated_rate(
-            table, infos, column_map.rate_hz if column_map is not None else None
-        )
-        index = np.arange(next(iter(channels.values())).size)
-        notes += rate_notes
+    notes += rate_notes
     missing = [name for name in known.channels if name not in channels]
     notes.append(f"not in the file: {', '.join(missing)}")
-    notes += [f"{name}: all samples lost" for name in order if np.isnan(channels[name]).all()]
+    notes += [f"{name}: all samples lost" for name in channels if np.isnan(channels[name]).all()]
     notes += _check_plausibility(table, sources, channels, known, rate)
     labels = {name: values[name] for name in LABEL_UNITS if name in values}
     samples = ImportedSamples(rate, index, channels, (*table.notes, *notes), labels)
@@ -240,18 +233,12 @@ def _is_derived_disp(values: Mapping[str, Float1D]) -> bool:
     )
 
 
-def _read_file_time(
-    table: SampleTable, sources: dict[str, ColumnSource], column_map: ColumnMap | None
-) -> Float1D | None:
-    """Return the times in s, (row,), stored with the columns; None if absent or overridden."""
-    clocks = {table.columns[column.column].clock for column in sources.values()}
-    if (
-        "" in clocks
-        or TIME_COLUMN in sources
-        or (column_map is not None and column_map.rate_hz is not None)
-    ):
+def _read_clock(table: ForeignTable, sources: dict[str, ColumnSource], size: int) -> Float1D | None:
+    """Return the times in s, (row,), stored with the columns; None if some have none."""
+    clocks = {table.columns[source.column].clock for source in sources.values()}
+    if "" in clocks:
         return None
-    first, *rest = (table.read_column(clock) for clock in sorted(clocks))
+    first, *rest = (table.read_column(clock)[:size] for clock in sorted(clocks))
     if any(not np.array_equal(first, other) for other in rest):
         raise InputError(
             "the columns have different sampling times",
@@ -262,7 +249,7 @@ def _read_file_time(
 
 
 def _select_columns(
-    table: SampleTable, column_map: ColumnMap | None, known: ImportColumns, leave_out: bool
+    table: ForeignTable, column_map: ColumnMap | None, known: ImportColumns, leave_out: bool
 ) -> tuple[dict[str, ColumnSource], list[str]]:
     """Select the source of each channel, by the map and by name; return (sources, notes)."""
     mapped = dict(column_map.columns) if column_map is not None else {}
@@ -276,9 +263,7 @@ def _select_columns(
             continue
         if name.startswith(TWIN_PREFIX):
             twins += 1
-        elif name in known.names and (
-            name != TIME_COLUMN or column_map is None or column_map.rate_hz is None
-        ):
+        elif name in known.names:
             mapped[name] = ColumnSource(column=name)
         elif not leave_out:
             raise InputError(
@@ -304,15 +289,18 @@ def _select_columns(
         for name, source in mapped.items()
         if source.column != name
     ]
+    left_out += [
+        f"{name} ({why})" for name, why in table.dropped.items() if name not in table.texts
+    ]
     notes += [f"left out: {_abbreviate(left_out)}"] if left_out else []
     notes += [f"left out: {twins} columns of a twin; it is recomputed"] if twins else []
     return mapped, notes
 
 
-def _missing_column_error(table: SampleTable, name: str, column: str) -> InputError:
-    if column in table.skipped:
+def _missing_column_error(table: ForeignTable, name: str, column: str) -> InputError:
+    if column in table.dropped:
         return InputError(
-            f"{column!r}, mapped to {name}, cannot be imported: {table.skipped[column]}",
+            f"{column!r}, mapped to {name}, cannot be imported: {table.dropped[column]}",
             where=table.path,
         )
     return InputError(
@@ -331,7 +319,7 @@ def _abbreviate(names: list[str]) -> str:
     return ", ".join(names[:MAX_LISTED_COLUMNS]) + more
 
 
-def _check_unit(table: SampleTable, name: str, column: ColumnSource, recorded_unit: str) -> None:
+def _check_unit(table: ForeignTable, name: str, column: ColumnSource, recorded_unit: str) -> None:
     """Raise InputError if the unit in the file differs from that of the map or channel."""
     file_unit = table.columns[column.column].unit
     if not file_unit or (column.file_unit is not None and column.file_unit == file_unit):
@@ -349,30 +337,29 @@ def _check_unit(table: SampleTable, name: str, column: ColumnSource, recorded_un
     )
 
 
-def _check_lengths(table: SampleTable, sources: dict[str, ColumnSource]) -> None:
-    """Raise InputError if the columns differ in length or exceed the size limit."""
-    sizes = {column.column: table.columns[column.column].size for column in sources.values()}
-    if len(set(sizes.values())) > 1:
-        lengths = _abbreviate([f"{name}: {size}" for name, size in sizes.items()])
+def _find_common_size(
+    table: ForeignTable, sources: dict[str, ColumnSource]
+) -> tuple[int, list[str]]:
+    """Return (rows that all columns have, notes); InputError if no rate tells that they are the
+    same rows."""
+    columns = {source.column: table.columns[source.column] for source in sources.values()}
+    sizes = {name: column.size for name, column in columns.items()}
+    size = min(sizes.values())
+    if size == max(sizes.values()):
+        return size, []
+    lengths = _abbreviate([f"{name}: {count}" for name, count in sizes.items()])
+    times = {(column.rate_hz, column.start_s, bool(column.clock)) for column in columns.values()}
+    if len(times) > 1 or None in next(iter(times)):
         raise InputError(
             f"columns of different length ({lengths})",
             where=table.path,
             remedy="select those of one recording by `group` in a --columns file, or one by one",
         )
-    check_size(table, [*sizes])
+    return size, [f"warning: columns of different length ({lengths}): the first {size} are taken"]
 
 
-def _select_rows(
-    table: SampleTable,
-    sources: dict[str, ColumnSource],
-    column_map: ColumnMap,
-    time: Float1D | None,
-) -> tuple[slice, str]:
+def _select_rows(table: ForeignTable, column_map: ColumnMap, time: Float1D) -> tuple[slice, str]:
     """Return (rows from `from_s` to `to_s`, note); raise InputError if none is between them."""
-    if time is None:
-        infos = [table.columns[column.column] for column in sources.values()]
-        rate_hz, _ = resolve_stated_rate(table, infos, column_map.rate_hz)
-        time = infos[0].start_s + np.arange(infos[0].size) / rate_hz
     first_s = -np.inf if column_map.from_s is None else column_map.from_s
     last_s = np.inf if column_map.to_s is None else column_map.to_s
     inside = np.flatnonzero((time >= first_s) & (time <= last_s))
@@ -388,7 +375,7 @@ def _select_rows(
 
 
 def _check_plausibility(
-    table: SampleTable,
+    table: ForeignTable,
     sources: dict[str, ColumnSource],
     channels: dict[str, Float1D],
     known: ImportColumns,

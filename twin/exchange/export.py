@@ -1,19 +1,19 @@
-"""`shaketwin export`: conversion of a log to formats of other tools."""
+"""Task `export`: conversion of a log to files of other tools."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from table_io.errors import InputError, format_pip_line
+from table_io.errors import InputError, require_package
 from table_io.records import RunStart
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
 from twin.results.recordings import open_recording
 from twin.results.rerun import restore_log
-from twin.system.terminal import error_console, print_line
 
 # File suffix by format. The Foxglove layout is a second file.
 SUFFIXES = {
@@ -26,72 +26,87 @@ SUFFIXES = {
 LAYOUT_SUFFIX = ".layout.json"
 
 
-def export_log(
-    log: Path,
-    formats: list[str],
-    out: Path | None,
-    channels: tuple[str, ...],
-    steps: tuple[int, int] | None,
-) -> int:
-    """Export a log to new files, one per format; return the exit code."""
-    if not formats:
+@dataclass(frozen=True)
+class ExportOptions:
+    """What is exported of a log, and in which formats (SUFFIXES).
+
+    `out`: the new files without their suffix; next to the log by default. `channels` and `steps`
+    (first and last index): all by default.
+    """
+
+    log: Path
+    formats: tuple[str, ...]
+    out: Path | None = None
+    channels: tuple[str, ...] = ()
+    steps: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True)
+class Exported:
+    """New files of an export, the size of its table, and whether the log was whole."""
+
+    files: tuple[Path, ...]
+    rows: int = 0
+    columns: int = 0
+    is_intact: bool = True
+
+
+def export_log(options: ExportOptions) -> Exported:
+    """Export a log to new files, one per format; all of them or, on an error, none."""
+    if not options.formats:
         raise InputError(
-            "no export format", where=log, remedy=f"give one or more of --{', --'.join(SUFFIXES)}"
+            "no export format",
+            where=options.log,
+            remedy=f"give one or more of --{', --'.join(SUFFIXES)}",
         )
-    path = resolve_log_path(log)
-    if not path.is_file():
-        raise InputError("no such log", where=path, remedy="give a run.mcap or the folder of a run")
-    paths = {kind: _output_path(kind, out or path.with_suffix("")) for kind in formats}
-    for file_format, output_path in paths.items():
-        for new in (
-            (output_path, _layout_path(output_path))
-            if file_format == "foxglove"
-            else (output_path,)
-        ):
-            if new.exists():
-                raise InputError("exists already", where=new, remedy="nothing is ever overwritten")
-    if "rrd" in paths and (channels or steps):
+    log = resolve_log_path(options.log)
+    if not log.is_file():
+        raise InputError("no such log", where=log, remedy="give a run.mcap or the folder of a run")
+    base = options.out or log.with_suffix("")
+    paths = {kind: _output_path(kind, base) for kind in options.formats}
+    layout = _layout_path(paths["foxglove"]) if "foxglove" in paths else None
+    for new in (*paths.values(), *([layout] if layout else [])):
+        if new.exists():
+            raise InputError("exists already", where=new, remedy="nothing is ever overwritten")
+    if "rrd" in paths and (options.channels or options.steps):
         raise InputError("exports a whole run", where="--rrd", remedy="omit --channel and --steps")
     # Check everything before the first file is written, so that a second attempt can succeed.
-    writers = {kind: _load_writer(kind) for kind in paths if kind != "rrd"}
-    needs_twin = not channels or any(name.startswith(TWIN_PREFIX) for name in channels)
+    if "parquet" in paths:
+        require_package("pyarrow", "formats", "--parquet")
+    needs_twin = not options.channels or any(n.startswith(TWIN_PREFIX) for n in options.channels)
+    files: list[Path] = []
     with TemporaryDirectory() as scratch, ExitStack() as cleanup:
-        whole = restore_log(path, Path(scratch)) if needs_twin else path
-        rows = _read_rows(whole, channels, steps) if writers else None
-        _make_folder(paths[formats[0]].absolute().parent, cleanup)
-        messages: list[str] = []
-        if "rrd" in paths:
-            _write_rrd(whole, paths["rrd"])
-            cleanup.callback(paths["rrd"].unlink, missing_ok=True)
-            messages.append(f"{paths['rrd']}")
-        if rows is not None:
-            for file_format, write in writers.items():
-                messages += _write_format(file_format, write, rows, paths[file_format], cleanup)
+        whole = restore_log(log, Path(scratch)) if needs_twin else log
+        rows = _read_rows(whole, options) if {*paths} - {"rrd"} else None
+        _make_folder(base.absolute().parent, cleanup)
+        for kind, path in paths.items():
+            if rows is None or kind == "rrd":
+                _write_rrd(whole, path)
+            else:
+                _write_rows(kind, rows, path)
+            cleanup.callback(path.unlink, missing_ok=True)
+            files.append(path)
+            if kind == "foxglove" and rows is not None and layout is not None:
+                _write_layout(rows, layout)
+                cleanup.callback(layout.unlink, missing_ok=True)
+                files.append(layout)
         cleanup.pop_all()  # keep the files
-    for line in messages:
-        print_line(line)
-    return 0
+    if rows is None:
+        return Exported((*files,))
+    return Exported((*files,), rows.size, len(rows.units), rows.is_intact)
 
 
-def _read_rows(path: Path, channels: tuple[str, ...], steps: tuple[int, int] | None) -> LogTable:
-    """Read the rows to export; warn if the log is unfinished or has invalid items."""
-    rows = read_log_table(path).select(channels, steps)
+def _read_rows(path: Path, options: ExportOptions) -> LogTable:
+    """Read the rows to export."""
+    rows = read_log_table(path).select(options.channels, options.steps)
     if not rows.size:
         raise InputError("no measured samples to export", where=path)
-    if not rows.is_intact:
-        warning = (
-            f"warning: {path} is unfinished or has invalid items; "
-            f"`shaketwin verify {path}` lists what is missing"
-        )
-        error_console.print(warning, highlight=False, soft_wrap=True)
     return rows
 
 
 def _make_folder(folder: Path, cleanup: ExitStack) -> None:
     """Create a folder with its parents; on failure, new ones that are empty are removed."""
-    for new_folder in reversed(
-        [new_folder for new_folder in (folder, *folder.parents) if not new_folder.exists()]
-    ):
+    for new_folder in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
         new_folder.mkdir(exist_ok=True)
         cleanup.callback(_remove_if_empty, new_folder)
 
@@ -101,52 +116,41 @@ def _remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _write_format(
-    file_format: str,
-    write: Callable[[LogTable, Any], None],
-    rows: LogTable,
-    path: Path,
-    cleanup: ExitStack,
-) -> list[str]:
-    """Write the files of one format; return lines for the user."""
-    text = {"encoding": "utf-8", "newline": ""}
-    with _open_new(path, "x", **text) if file_format == "csv" else _open_new(path, "xb") as file:
-        write(rows, file)
-    cleanup.callback(path.unlink, missing_ok=True)
-    messages = [f"{rows.size} rows of {len(rows.units)} columns -> {path}"]
-    if file_format == "foxglove":
-        from twin.exchange.foxglove import build_layout
+def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
+    """Write the rows to a new file; imports the library of the format."""
+    if kind == "csv":
+        from table_io.formats.text import write_csv
 
-        with _open_new(_layout_path(path), "x", encoding="utf-8") as file:
-            file.write(build_layout(rows))
-        cleanup.callback(_layout_path(path).unlink, missing_ok=True)
-        messages.append(f"{_layout_path(path)}")
-    return messages
+        with _open_new(path, "x", encoding="utf-8", newline="") as file:
+            write_csv(rows.units, rows.iter_windows(), file)
+        return
+    start = rows.start
+    with _open_new(path, "xb") as file:
+        if kind == "parquet":
+            from table_io.formats.parquet import write_parquet
+
+            texts = {"run": start.run, "rate_hz": repr(start.rate_hz), **rows.toml_texts}
+            write_parquet(rows.units, rows.iter_windows(), texts, file)
+        elif kind == "mat":
+            from table_io.formats.mat import write_mat
+
+            facts: dict[str, str | float] = {**rows.toml_texts, "run": start.run}
+            facts["rate_hz"] = start.rate_hz
+            # one by one, to limit memory
+            columns = (rows.read_columns(slice(None), name) for name in rows.units)
+            write_mat(rows.units, columns, facts, file)
+        else:
+            from twin.exchange.foxglove import write_foxglove
+
+            write_foxglove(rows, file)
 
 
-def _load_writer(file_format: str) -> Callable[[LogTable, Any], None]:
-    """Return the writer of a format; imports its library only when needed."""
-    if file_format == "csv":
-        from twin.exchange.formats.csv import write_csv
+def _write_layout(rows: LogTable, path: Path) -> None:
+    """Write the layout of Foxglove for the rows to a new file."""
+    from twin.exchange.foxglove import build_layout
 
-        return write_csv
-    if file_format == "mat":
-        from twin.exchange.formats.mat import write_mat
-
-        return write_mat
-    if file_format == "foxglove":
-        from twin.exchange.foxglove import write_foxglove
-
-        return write_foxglove
-    try:
-        from twin.exchange.formats.parquet import write_parquet
-    except ModuleNotFoundError as error:
-        raise InputError(
-            f"{error.name} is not installed",
-            where=f"--{file_format}",
-            remedy=format_pip_line("formats"),
-        ) from None
-    return write_parquet
+    with _open_new(path, "x", encoding="utf-8") as file:
+        file.write(build_layout(rows))
 
 
 def _write_rrd(path: Path, output_path: Path) -> None:

@@ -15,12 +15,12 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from table_io.block import Int1D
+from table_io.channels import TIME_COLUMN
 from table_io.records import Event, NormalizedResponse, PrcPoint, Record, format_record
 from twin.recording.mcap_log import open_foreign_log
 from twin.recording.tabular import (
     DIRECTION_SIGNS,
     LABEL_UNITS,
-    TIME_COLUMN,
     TWIN_PREFIX,
     WINDOW_ROWS,
     Columns,

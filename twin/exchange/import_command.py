@@ -12,8 +12,8 @@ from rich.table import Table
 from table_io.config.channel import read_channels
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
+from table_io.formats import read_table
 from twin.exchange.columns import ImportColumns
-from twin.exchange.formats import read_table
 from twin.exchange.import_table import ImportOptions, import_samples, read_rig_toml
 from twin.exchange.proposal import MapProposal, propose_map
 from twin.system.terminal import console, print_line, print_table
@@ -112,10 +112,12 @@ def print_proposal(file: Path, proposal: MapProposal) -> None:
     print_table(console, table)
     if proposal.rate_hz is not None:
         print_line(f"sampling rate: {proposal.rate_hz:.9g} Hz")
+    elif proposal.file_rate_hz is not None:
+        print_line(f"sampling rate: {proposal.file_rate_hz:.9g} Hz, stated in the file")
     mass = "not stated" if proposal.mass_kg is None else f"{proposal.mass_kg:g} kg"
     print_line(f"mass: {mass}")
-    if proposal.left_out:
-        print_line(f"left out: {', '.join(proposal.left_out)}")
+    for text in (*proposal.left_out, *proposal.dropped):
+        print_line(f"left out: {text}")
     for text in proposal.missing:
         print_line(f"missing: {text}")
     for text in proposal.questions:

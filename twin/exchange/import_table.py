@@ -17,6 +17,9 @@ from table_io.config.folders import find_config
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from table_io.formats import read_table
+from table_io.formats.table import TOML_TEXTS, ForeignTable
+from table_io.formats.timing import find_holes
 from table_io.records import Event, RunStart, RunStop, SampleGap
 from twin.compare.step_detection import DetectedSteps, find_steps
 from twin.exchange.columns import (
@@ -26,10 +29,8 @@ from twin.exchange.columns import (
     read_column_map,
     read_samples,
 )
-from twin.exchange.formats import TOML_TEXTS, SampleTable, read_table
 from twin.exchange.labels import read_labels, typical_cycles
 from twin.exchange.proposal import propose_map
-from twin.exchange.sampling import find_holes
 from twin.report.finalize import EXIT_GAPS
 from twin.setup.run_config import RunConfig, from_texts, make_run_id, read_model
 from twin.setup.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
@@ -185,7 +186,7 @@ def import_samples(
 
 
 def _accept_proposal(
-    table: SampleTable, known: ImportColumns, options: ImportOptions, profile: Path | None
+    table: ForeignTable, known: ImportColumns, options: ImportOptions, profile: Path | None
 ) -> ColumnMap:
     """Return the proposed map; raise InputError if it is open. A profile states its own mass."""
     proposal = propose_map(table, known, options.settings)
@@ -262,12 +263,12 @@ def print_contents(file: Path, columns: Path | None) -> None:
         print_line(line)
 
 
-def _has_config_texts(table: SampleTable) -> bool:
+def _has_config_texts(table: ForeignTable) -> bool:
     """Return whether the table carries profile, rig and model, as an export does."""
     return len(table.texts) == len(TOML_TEXTS)
 
 
-def read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) -> str:
+def read_rig_toml(table: ForeignTable, profile: Path | None, rig: str | None) -> str:
     """Read the text of the rig file: the one given, else of the table, else of the profile."""
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
@@ -280,7 +281,7 @@ def read_rig_toml(table: SampleTable, profile: Path | None, rig: str | None) -> 
 
 
 def _build_run_config(
-    table: SampleTable,
+    table: ForeignTable,
     profile: Path | None,
     rig_toml: str,
     rate_hz: float,
@@ -310,7 +311,7 @@ def _build_run_config(
 
 
 def _build_placeholder(
-    table: SampleTable,
+    table: ForeignTable,
     rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,

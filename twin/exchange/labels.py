@@ -5,17 +5,17 @@ from numpy.typing import NDArray
 
 from table_io.block import Float1D, Int1D, Label
 from table_io.errors import InputError
+from table_io.formats.table import ForeignTable
 from table_io.records import Step
 from twin.compare.step_detection import DetectedSteps
 from twin.exchange.columns import ImportedSamples
-from twin.exchange.formats import SampleTable
 from twin.recording.tabular import DIRECTION_SIGNS
 
 MAX_COUNT = 10**6  # of steps, and of cycles in a step
 MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
 
 
-def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
+def read_labels(table: ForeignTable, samples: ImportedSamples) -> DetectedSteps:
     """Return the table's labels on the time grid; raise InputError that names an invalid row.
 
     Samples in a hole are at rest. Steps, or windows of a displacement history, are renumbered from
@@ -36,7 +36,7 @@ def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
         if sign[row] == 0 or not plan["frequency_hz"] > 0 or not plan["level_m_s2"] >= 0:
             raise InputError(
                 f"step {step[row]} lacks direction, frequency_hz or level_m_s2",
-                where=_describe_row(table, row),
+                where=table.describe_row(row),
                 remedy="fill in all three for every step",
             )
         direction = {number: name for name, number in DIRECTION_SIGNS.items()}[int(sign[row])]
@@ -48,7 +48,7 @@ def read_labels(table: SampleTable, samples: ImportedSamples) -> DetectedSteps:
             raise InputError(
                 f"{name} is {columns[name][row]:.9g} in step {step[row]}, "
                 f"but {columns[name][firsts[place[row]]]:.9g} in an earlier row of it",
-                where=_describe_row(table, row),
+                where=table.describe_row(row),
                 allowed="one value per step",
             )
     outside = int((numbers < 0).any())
@@ -92,7 +92,7 @@ def _typical_cycle_count(detected: DetectedSteps, is_counted: NDArray[np.bool_])
 
 
 def _read_integers(
-    table: SampleTable, columns: dict[str, Float1D], name: str, low: int, high: int
+    table: ForeignTable, columns: dict[str, Float1D], name: str, low: int, high: int
 ) -> Int1D:
     """Return a column as integers; raise InputError unless all are whole and in [low, high]."""
     values = columns[name]
@@ -101,11 +101,7 @@ def _read_integers(
         row = int(np.argmax(is_wrong))
         raise InputError(
             f"{name} is {values[row]:.9g}",
-            where=_describe_row(table, row),
+            where=table.describe_row(row),
             allowed=f"whole numbers from {low} to {high}",
         )
     return values.astype(np.int64)
-
-
-def _describe_row(table: SampleTable, row: int) -> str:
-    return f"{table.path}: row {row + table.first_row}"

@@ -5,33 +5,28 @@ or saves it as a map to edit. What names and units leave open is a question, nev
 """
 
 import json
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from table_io.block import Float1D
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS, TIME_COLUMN
+from table_io.formats.table import ForeignTable
+from table_io.formats.timing import INTERVAL_SPREAD, find_time_column
+from table_io.formats.words import (
+    TIME_UNITS,
+    find_quantity,
+    find_stated_unit,
+    matches_words,
+    split_words,
+)
 from table_io.units import UNITS
 from twin.exchange.columns import CANONICAL_COLUMNS, ColumnMap, ColumnSource, ImportColumns
-from twin.exchange.formats import SampleTable
-from twin.exchange.formats.layout import TIME_UNITS, find_unit, is_unit, normalize_unit
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
-from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
 
-QUANTITY_WORDS = {
-    "time": {"t", "time", "timestamp", "elapsed", "zeit", "tempo"},
-    "displacement": {
-        "x", "u", "d", "disp", "displ", "displacement", "dist", "distance", "pos", "position",
-        "laser", "lvdt", "stroke", "deformation", "elongation", "spostamento", "weg",
-    },
-    "acceleration": {"a", "acc", "accel", "acceleration", "accelerometer", "accelerazione"},
-    "force": {"f", "force", "forc", "load", "loadcell", "cell", "lc", "reaction", "forza", "kraft"},
-    "velocity": {"v", "vel", "velocity", "speed"},
-}  # fmt: skip
-QUANTITY_UNITS = {"m": "displacement", "m/s2": "acceleration", "N": "force", "m/s": "velocity"}
 BODY_WORDS = {
     "command": {"cmd", "command", "commanded", "reference", "ref", "drive", "setpoint", "target"},
     "relative": {
@@ -64,8 +59,6 @@ CHANNELS_OF = {
 }
 FACT_KEYS = ("rate_hz", "mass_kg")
 OPEN_UNIT = "?"  # in a saved map: refused until a person replaces it
-MIN_PREFIX_LETTERS = 4  # "accelero" is an accelerometer
-INTERVAL_SPREAD = 0.01  # relative, of a column of times
 
 
 @dataclass(frozen=True)
@@ -83,11 +76,13 @@ class MapProposal:
     """Proposed map of a table. `questions` are what a person must answer before an import."""
 
     columns: tuple[ProposedColumn, ...]
-    rate_hz: float | None = None
+    rate_hz: float | None = None  # to be stated in the map; without times in the file
+    file_rate_hz: float | None = None  # that the file states for its columns
     mass_kg: float | None = None
     questions: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()  # with the reason why they are no columns
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def to_map(self) -> ColumnMap:
@@ -123,7 +118,7 @@ class MapProposal:
 
 
 def propose_map(
-    table: SampleTable,
+    table: ForeignTable,
     known: ImportColumns = CANONICAL_COLUMNS,
     settings: Mapping[str, Any] | None = None,
 ) -> MapProposal:
@@ -135,14 +130,14 @@ def propose_map(
     table = replace(table, facts=table.facts | stated)
     names = [
         name
-        for name in _longest_columns(table)
+        for name in _select_recording(table)
         if name not in LABEL_UNITS and not name.startswith(TWIN_PREFIX)
     ]
-    quantities = {name: _find_quantity(table, name) for name in names}
+    quantities = {name: find_quantity(name, table.columns[name].unit) for name in names}
     questions: list[str] = []
     alternatives: dict[str, tuple[str, ...]] = {}
     chosen: dict[str, str] = {name: name for name in names if name in known.channels}
-    time_column = _find_time(table, names, quantities)
+    time_column = find_time_column(table, names)
     sorted_names = [name for name in names if name not in chosen and name != time_column]
     for quantity, possible in CHANNELS_OF.items():
         group = [name for name in sorted_names if quantities[name] == quantity]
@@ -163,81 +158,58 @@ def propose_map(
         unit, reason, question = _propose_unit(table, channel, name, chosen, known)
         columns.append(ProposedColumn(channel, name, OPEN_UNIT if question else unit, reason))
         questions += [question] if question else []
-    infos = [table.columns[name] for name in chosen.values()]
-    has_time = bool(time_column) or any(info.clock or info.rate_hz for info in infos)
+    infos = [table.columns[name] for name in names]
+    file_rate_hz = next((info.rate_hz for info in infos if info.rate_hz), None)
+    has_time = bool(time_column or file_rate_hz) or any(info.clock for info in infos)
     rate_hz = None if has_time else table.facts.get("rate_hz")
     if not has_time and rate_hz is None:
         questions.append("no times and no sampling rate in the file: state --rate HZ")
     if not chosen:
         questions.append("no column is known by its name or unit: state the columns in a map")
-    open_names = {*alternatives, *chosen.values(), time_column}
+    clocks = {info.clock for info in infos}
+    open_names = {*alternatives, *chosen.values(), time_column, *clocks}
     return MapProposal(
-        tuple(columns), rate_hz, table.facts.get("mass_kg"), tuple(questions),
-        tuple(_list_missing({*chosen}, "mass_kg" in table.facts, settings or {}))
+        columns=tuple(columns),
+        rate_hz=rate_hz,
+        file_rate_hz=file_rate_hz,
+        mass_kg=table.facts.get("mass_kg"),
+        questions=tuple(questions),
+        missing=tuple(_list_missing({*chosen}, "mass_kg" in table.facts, settings or {}))
         if chosen
         else (),
-        tuple(name for name in names if name not in open_names),
-        alternatives,
-    )  # fmt: skip
-
-
-def _longest_columns(table: SampleTable) -> list[str]:
-    """Return the columns of the most frequent length: those of one recording."""
-    sizes = [info.size for info in table.columns.values()]
-    size = max(sizes, key=lambda length: (sizes.count(length), length))
-    return [name for name, info in table.columns.items() if info.size == size]
-
-
-def _split_words(name: str) -> list[str]:
-    """Return the lower-case words of a column name, without a unit in brackets at its end."""
-    bare = re.sub(r"[(\[][^()\[\]]*[)\]]\s*$", "", name)
-    spaced = re.sub(r"(?<=[a-z])(?=[A-Z])", " ", bare)
-    return [word for word in re.split(r"[^a-zA-Z0-9]+", spaced.lower()) if word]
-
-
-def _stated_unit(table: SampleTable, name: str) -> str:
-    """Return the unit that the file or the end of the name states, "" without one."""
-    unit = normalize_unit(table.columns[name].unit) or find_unit(name)
-    if unit:
-        return unit
-    words = re.split(r"[^a-zA-Z0-9/²]+", name.strip(" )]"))
-    if len(words) > 2 and is_unit("/".join(words[-2:])):  # acc_m_s2
-        return normalize_unit("/".join(words[-2:]))
-    return normalize_unit(words[-1]) if len(words) > 1 and is_unit(words[-1]) else ""
-
-
-def _matches(words: Sequence[str], known: set[str]) -> bool:
-    return any(
-        word.rstrip("0123456789") in known
-        or word in known
-        or (
-            len(word) >= MIN_PREFIX_LETTERS
-            and any(len(k) >= MIN_PREFIX_LETTERS and word.startswith(k) for k in known)
-        )
-        for word in words
+        left_out=tuple(name for name in names if name not in open_names),
+        dropped=_list_dropped(table, names),
+        alternatives=alternatives,
     )
 
 
-def _find_quantity(table: SampleTable, name: str) -> str:
-    """Return the quantity of a column by its unit, else by its name; "" if neither tells."""
-    unit = _stated_unit(table, name)
-    by_unit = QUANTITY_UNITS.get(UNITS[unit][0]) if unit in UNITS else None
-    if by_unit:
-        return by_unit
-    words = _split_words(name)
-    quantities = [key for key, known in QUANTITY_WORDS.items() if _matches(words, known)]
-    long_words = [word for word in words if len(word.rstrip("0123456789")) > 1]
-    if len(quantities) > 1:  # "acc x": a letter may be an axis
-        quantities = [
-            key for key, known in QUANTITY_WORDS.items() if _matches(long_words, known)
-        ] or quantities
-    return quantities[0] if len(quantities) == 1 else ""
+def _list_dropped(table: ForeignTable, names: list[str]) -> tuple[str, ...]:
+    """Return what is no column of the recording, each with the reason."""
+    others = [
+        f"{name} ({column.size} rows, the others {table.columns[names[0]].size})"
+        for name, column in table.columns.items()
+        if names and column.size != table.columns[names[0]].size and name not in names
+    ]
+    dropped = [f"{name} ({why})" for name, why in table.dropped.items() if name not in table.texts]
+    return (*others, *dropped)
+
+
+def _select_recording(table: ForeignTable) -> list[str]:
+    """Return the columns of one recording: of the most frequent length, or of its times."""
+    sizes = [column.size for column in table.columns.values()]
+    size = max(sizes, key=lambda length: (sizes.count(length), length))
+    rates = {(c.rate_hz, c.start_s) for c in table.columns.values() if c.size == size and c.rate_hz}
+    return [
+        name
+        for name, column in table.columns.items()
+        if column.size == size or (column.rate_hz, column.start_s) in rates
+    ]
 
 
 def _find_body(name: str) -> str:
     """Return the body that the name tells, "" if none or several."""
-    words = _split_words(name)
-    bodies = [body for body, known in BODY_WORDS.items() if _matches(words, known)]
+    words = split_words(name)
+    bodies = [body for body, known in BODY_WORDS.items() if matches_words(words, known)]
     return bodies[0] if len(bodies) == 1 else ""
 
 
@@ -257,22 +229,9 @@ def _choose_channel(
     return "" if channel in chosen or is_ambiguous else channel
 
 
-def _find_time(table: SampleTable, names: list[str], quantities: dict[str, str]) -> str:
-    """Return the column of times, "" without one: by its name, else by numbers that rise evenly."""
-    by_name = [name for name in names if quantities[name] == "time" or name == TIME_COLUMN]
-    for name in by_name or [name for name in names if not quantities[name]]:
-        values = table.read_column(name)
-        steps = np.diff(values)
-        if steps.size > 1 and (steps > 0).all():
-            spread = float(np.std(steps) / np.mean(steps))
-            if by_name or spread < INTERVAL_SPREAD:
-                return name
-    return ""
-
-
-def _propose_time_unit(table: SampleTable, name: str) -> tuple[str, str]:
+def _propose_time_unit(table: ForeignTable, name: str) -> tuple[str, str]:
     """Return (unit, reason) of a column of times."""
-    unit = _stated_unit(table, name)
+    unit = find_stated_unit(name, table.columns[name].unit)
     if unit in TIME_UNITS:
         return unit, "stated in the file"
     rate_hz = table.facts.get("rate_hz")
@@ -285,11 +244,11 @@ def _propose_time_unit(table: SampleTable, name: str) -> tuple[str, str]:
 
 
 def _propose_unit(
-    table: SampleTable, channel: str, name: str, chosen: dict[str, str], known: ImportColumns
+    table: ForeignTable, channel: str, name: str, chosen: dict[str, str], known: ImportColumns
 ) -> tuple[str, str, str]:
     """Return (unit, reason, question) of the source of a channel."""
     allowed = known.unit_factors(channel)
-    stated = _stated_unit(table, name)
+    stated = find_stated_unit(name, table.columns[name].unit)
     if name == channel:
         return "", "its name", ""
     if stated in allowed:
@@ -314,22 +273,23 @@ def _propose_unit(
     )  # fmt: skip
 
 
-def _unit_by_partner(table: SampleTable, channel: str, name: str, chosen: dict[str, str]) -> str:
+def _unit_by_partner(table: ForeignTable, channel: str, name: str, chosen: dict[str, str]) -> str:
     """Return the unit of a displacement or acceleration by its partner with a stated unit."""
     rate_hz = table.facts.get("rate_hz") or 1.0
     for disp, acc in CHECKED_PAIRS:
         if channel not in (disp, acc) or not {disp, acc} <= chosen.keys():
             continue
         partner = chosen[acc if channel == disp else disp]
-        unit = _stated_unit(table, partner)
-        time = _find_time(table, [*table.columns], dict.fromkeys(table.columns, ""))
+        unit = find_stated_unit(partner, table.columns[partner].unit)
+        time = find_time_column(table, [*table.columns])
         if time:
             rate_hz = 1.0 / float(np.median(np.diff(table.read_column(time))))
         if not unit:
             continue
+        size = min(table.columns[chosen[name]].size for name in (disp, acc))
         pairs = match_unit_pairs(
-            _remove_mean(table.read_column(chosen[disp])),
-            _remove_mean(table.read_column(chosen[acc])),
+            _remove_mean(table.read_column(chosen[disp])[:size]),
+            _remove_mean(table.read_column(chosen[acc])[:size]),
             rate_hz,
         )
         fitting = {d if channel == disp else a for d, a in pairs if unit in (d, a)}

@@ -17,7 +17,12 @@ from typing import IO, Any
 import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Int1D
-from table_io.channels import RELATIVE_DISP_SOURCES, Channel, list_derived_channels
+from table_io.channels import (
+    RELATIVE_DISP_SOURCES,
+    TIME_COLUMN,
+    Channel,
+    list_derived_channels,
+)
 from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
@@ -32,7 +37,6 @@ LABEL_UNITS = {
     "level_m_s2": "m/s2",
 }  # fmt: skip
 DIRECTION_SIGNS = {"forward": 1, "backward": -1}
-TIME_COLUMN = "time_s"
 TWIN_PREFIX = "twin_"
 SCRATCH_COLUMNS = ("index", "step", "label", "cycle")  # before the channels of a sample
 KEPT_RECORDS = (RunStop, Event, PrcPoint, StepAdded)

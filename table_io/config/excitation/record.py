@@ -1,6 +1,6 @@
 """Record: a displacement or acceleration history from a file, such as an earthquake.
 
-The format follows from the name of the file and its first line (`record_files.py`). A displacement
+Its table is read as those of an import (`table_io/formats`). A displacement
 is scaled and resampled to the rate of the rig by band-limited interpolation; its first and last
 samples need not be at rest: quintic blends before and after it, continuous in value and velocity,
 lead from rest and to rest. An acceleration is freed of its baseline, limited to a band and
@@ -15,6 +15,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from functools import cached_property
+from pathlib import PurePath
 from typing import Any, ClassVar
 
 import numpy as np
@@ -31,17 +32,16 @@ from table_io.config.excitation.band_limit import (
     limit_band,
 )
 from table_io.config.excitation.record_files import (
-    BINARY_SUFFIXES,
     Quantity,
     RecordedSeries,
     RecordUnit,
     SeriesRequest,
     convert_binary,
-    drop_integrals,
-    is_volume_2,
     read_series,
 )
 from table_io.errors import InputError, is_control
+from table_io.formats import FORMATS, decode_text
+from table_io.formats.strong_motion import drop_integrals, is_volume_2
 
 CHECKSUM_SUFFIX = ".sha256"  # of the entry of `files` with the checksum of a converted file
 ACCELERATION_BAND_HZ = 0.1, 25.0
@@ -66,7 +66,7 @@ class SeriesKeys(ConfigModel):
 
 @register_excitation("record")
 class RecordedHistory(SeriesKeys, History):
-    """Displacement or acceleration history read from a file: csv, txt, AT2, V2, mat or npz."""
+    """Displacement or acceleration history read from a file: text, AT2, V2, mat and others."""
 
     FILE_KEYS: ClassVar[tuple[str, ...]] = ("file", *History.FILE_KEYS)
     LEVEL_KEY: ClassVar[str] = "scale"
@@ -96,7 +96,7 @@ class RecordedHistory(SeriesKeys, History):
     @classmethod
     def convert_file(cls, data: bytes, name: str, table: Mapping[str, Any]) -> dict[str, str]:
         """Return the text of a file, and its checksum if the text is not the file as it is."""
-        if name.lower().endswith(BINARY_SUFFIXES):
+        if PurePath(name).suffix.lower() in FORMATS:
             variable = table.get("variable")
             text = convert_binary(data, name, variable if isinstance(variable, str) else None)
         else:
@@ -193,11 +193,7 @@ class RecordedHistory(SeriesKeys, History):
 
 def _decode(data: bytes) -> str:
     """Return the text of a file with line feeds, without the control characters of old systems."""
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = data.decode("latin-1")  # which old strong-motion files use in their headers
-    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    text = decode_text(data).replace("\r\n", "\n").replace("\r", "\n")
     if text.isascii() and text.replace("\n", "").isprintable():
         return text
     return "".join(" " if is_control(c) and c != "\n" else c for c in text)

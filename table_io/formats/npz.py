@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from twin.exchange.formats import ColumnKey, SampleTable, add_array, extract_column
+from table_io.formats.table import ColumnKey, ForeignTable, extract_column
 
 
-def scan_columns(path: Path) -> SampleTable:
+def scan_columns(path: Path) -> ForeignTable:
     """Scan the array headers of a file; values are not read."""
-    table = SampleTable(path)
+    table = ForeignTable(path, "", load=load_column)
     with zipfile.ZipFile(path) as archive:
         for member in archive.namelist():
             with archive.open(member) as file:
@@ -23,7 +23,7 @@ def scan_columns(path: Path) -> SampleTable:
                 )
                 shape, _, dtype = header(file)
             name = member.removesuffix(".npy")
-            add_array(table, name, shape, dtype.kind, (name,))
+            table.add_array(name, shape, dtype.kind, (name,))
     return table
 
 

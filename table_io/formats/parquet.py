@@ -1,27 +1,40 @@
 """Reader and writer of Parquet files; only this file imports pyarrow."""
 
+from collections.abc import Iterable, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from twin.exchange.formats import TOML_TEXTS, ColumnInfo, ColumnKey, SampleTable
-from twin.recording.tabular import LogTable
+from table_io.formats.table import (
+    TOML_TEXTS,
+    ColumnKey,
+    ForeignColumn,
+    ForeignTable,
+    TableColumns,
+)
 
 
-def scan_columns(path: Path) -> SampleTable:
+def scan_columns(path: Path) -> ForeignTable:
     """Scan the columns in the schema of a file; values are not read."""
-    table = SampleTable(path)
+    table = ForeignTable(path, "", load=load_column)
     with pq.ParquetFile(path) as file:
         schema, rows = file.schema_arrow, file.metadata.num_rows
     for column in schema:
-        numbers = (pa.types.is_floating, pa.types.is_integer, pa.types.is_boolean)
+        numbers = (
+            pa.types.is_floating,
+            pa.types.is_integer,
+            pa.types.is_boolean,
+            pa.types.is_timestamp,
+        )
         if not any(is_kind(column.type) for is_kind in numbers):
-            table.skipped[column.name] = str(column.type)
+            table.dropped[column.name] = str(column.type)
             continue
         unit = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
-        table.columns[column.name] = ColumnInfo(rows, (column.name,), unit)
+        unit = "s" if pa.types.is_timestamp(column.type) else unit
+        table.columns[column.name] = ForeignColumn(rows, (column.name,), unit)
     for key in TOML_TEXTS:
         if key.encode() in (schema.metadata or {}):
             table.texts[key] = schema.metadata[key.encode()].decode()
@@ -34,15 +47,20 @@ def load_column(path: Path, key: ColumnKey) -> Any:
         return file.read([*key], use_threads=False).column(0).to_numpy()
 
 
-def write_parquet(rows: LogTable, file: BinaryIO) -> None:
-    """Write the rows as Parquet, with units as field metadata and configs as file metadata."""
-    first = rows.read_columns(slice(0, 1))
+def write_parquet(
+    units: Mapping[str, str],
+    windows: Iterable[TableColumns],
+    facts: Mapping[str, str],
+    file: BinaryIO,
+) -> None:
+    """Write columns as Parquet, with units as field metadata and facts as file metadata."""
+    windows = iter(windows)
+    first = next(windows)
     fields = [
         pa.field(name, pa.from_numpy_dtype(first[name].dtype), metadata={"unit": unit})
-        for name, unit in rows.units.items()
+        for name, unit in units.items()
     ]
-    metadata = {"run": rows.start.run, "rate_hz": repr(rows.start.rate_hz), **rows.toml_texts}
-    schema = pa.schema(fields, metadata=metadata)
+    schema = pa.schema(fields, metadata=dict(facts))
     with pq.ParquetWriter(file, schema, compression="zstd", use_dictionary=False) as writer:
-        for window in rows.iter_windows():
+        for window in chain([first], windows):
             writer.write_table(pa.table([*window.values()], schema=schema))

@@ -12,14 +12,14 @@ import numpy as np
 import pyuff
 
 from table_io.errors import InputError
-from twin.exchange.formats import ColumnInfo, ColumnKey, SampleTable
+from table_io.formats.table import ColumnKey, ForeignColumn, ForeignTable
 
 TIME_ABSCISSA_TYPES = (0, 1, 17)  # unknown, general, time
 TIME_FUNCTION_TYPES = (0, 1)  # general, time response
 SECONDS_LABELS = ("", "none", "s", "sec", "second", "seconds")
 
 
-def scan_columns(path: Path) -> SampleTable:
+def scan_columns(path: Path) -> ForeignTable:
     """Scan the data sets of a file by their headers; raise InputError if none has type 58."""
     file = pyuff.UFF(str(path))
     types = [int(kind) for kind in file.get_set_types()]
@@ -29,16 +29,16 @@ def scan_columns(path: Path) -> SampleTable:
         )
     headers = {k: file.read_sets(k, header_only=True) for k, kind in enumerate(types) if kind == 58}
     name_counts = Counter(_header_text(head, "id1") for head in headers.values())
-    table = SampleTable(path)
+    table = ForeignTable(path, "", load=load_column)
     for k, header in headers.items():
         line = _header_text(header, "id1")
         name = line if line and name_counts[line] == 1 else f"set {k + 1} {line}".strip()
         reason = _skip_reason(header)
         if reason:
-            table.skipped[name] = reason
+            table.dropped[name] = reason
             continue
         is_even, step = header["abscissa_spacing"] == 1, float(header["abscissa_inc"])
-        table.columns[name] = ColumnInfo(
+        table.columns[name] = ForeignColumn(
             int(header["num_pts"]),
             (k, "data"),
             _header_text(header, "ordinate_axis_units_lab"),
@@ -47,7 +47,7 @@ def scan_columns(path: Path) -> SampleTable:
             "" if is_even else f"{name}/time",
         )
         if not is_even:
-            table.columns[f"{name}/time"] = ColumnInfo(int(header["num_pts"]), (k, "x"), "s")
+            table.columns[f"{name}/time"] = ForeignColumn(int(header["num_pts"]), (k, "x"), "s")
     return table
 
 

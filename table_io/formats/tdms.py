@@ -5,26 +5,25 @@ from typing import Any
 
 from nptdms import TdmsFile
 
-from twin.exchange.formats import ColumnInfo, ColumnKey, SampleTable
+from table_io.formats.table import ColumnKey, ForeignColumn, ForeignTable
 
 
-def scan_columns(path: Path) -> SampleTable:
+def scan_columns(path: Path) -> ForeignTable:
     """Scan the channels of a file; rate and start time are their waveform properties."""
     with TdmsFile.open(path) as file:
         is_truncated = file.file_status.incomplete_final_segment
-        table = SampleTable(
-            path, notes=("warning: the file ends inside a segment",) if is_truncated else ()
-        )
+        notes = ("warning: the file ends inside a segment",) if is_truncated else ()
+        table = ForeignTable(path, "", notes=notes, load=load_column)
         for group in file.groups():
             for channel in group.channels():
                 name = f"{group.name}/{channel.name}"
                 kind = "O" if channel.dtype is None else channel.dtype.kind
-                if kind not in "fiub" or len(channel) < 2:
-                    table.skipped[name] = f"{len(channel)} values of {channel.dtype}"
+                if kind not in "fiubM" or len(channel) < 2:
+                    table.dropped[name] = f"{len(channel)} values of {channel.dtype}"
                     continue
                 properties = channel.properties
                 step = float(properties.get("wf_increment", 0.0))
-                table.columns[name] = ColumnInfo(
+                table.columns[name] = ForeignColumn(
                     len(channel),
                     (group.name, channel.name),
                     str(properties.get("unit_string", "")),

@@ -1,0 +1,96 @@
+"""Reader of HDF5 and MATLAB v7.3 files; only this file imports h5py.
+
+Datasets are named by their path; the cells of a cell array and the elements of a structure array
+of MATLAB as in `mat`. Links into other files are never followed.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+
+from table_io.formats.table import TOML_TEXTS, ColumnKey, ForeignTable, extract_column
+from table_io.formats.words import LABEL_FIELDS, find_label
+
+UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
+MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
+MAX_REFERENCES = 1000  # of a cell array
+
+
+def scan_columns(path: Path) -> ForeignTable:
+    """Scan the datasets of a file; values are not read."""
+    table = ForeignTable(path, "", load=load_column)
+    with h5py.File(path, "r") as file:
+
+        def visit(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and not name.startswith("#"):
+                _add_dataset(table, name, item)
+
+        file.visititems(visit)
+    return table
+
+
+def load_column(path: Path, key: ColumnKey) -> Any:
+    """Read the values of a column, (row,)."""
+    name, field, k = key
+    with h5py.File(path, "r") as file:
+        return extract_column(file[name][field or ()], int(k))
+
+
+def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
+    if item.is_virtual or item.external:
+        table.dropped[name] = "its values are in another file"
+    elif _chunk_bytes(item) > MAX_CHUNK_BYTES:
+        table.dropped[name] = f"in chunks of more than {MAX_CHUNK_BYTES} bytes"
+    elif _to_text(item.attrs.get("MATLAB_class", "")) == "char":
+        table.dropped[name] = "text"
+        if name in TOML_TEXTS and item.size < 10**6:
+            table.texts[name] = _read_text(item)
+    elif "MATLAB_empty" in item.attrs or item.shape is None:
+        table.dropped[name] = "empty"
+    elif h5py.check_ref_dtype(item.dtype) is h5py.Reference:
+        _add_references(table, name, item)
+    elif item.dtype.names:
+        for field in item.dtype.names:
+            kind = item.dtype[field].kind if not item.dtype[field].shape else "V"
+            table.add_array(f"{name}/{field}", item.shape, kind, (name, field), group=name)
+    else:
+        unit = next((_to_text(item.attrs[key]) for key in UNIT_ATTRIBUTES if key in item.attrs), "")
+        table.add_array(
+            name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0]
+        )
+
+
+def _add_references(table: ForeignTable, name: str, item: Any) -> None:
+    """Add the arrays of a cell array, or of one field of a structure array, by their labels."""
+    if item.size > MAX_REFERENCES:
+        table.dropped[name] = f"{item.size} cells"
+        return
+    file, parent = item.file, name.rpartition("/")[0]
+    fields: list[Any] = [item.parent[field] for field in LABEL_FIELDS if field in item.parent]
+    labels = [field[()].reshape(-1) for field in fields if field.shape == item.shape]
+    for k, reference in enumerate(item[()].reshape(-1)):
+        cell: Any = file[reference] if reference else None
+        if getattr(cell, "dtype", None) is None or cell.dtype.kind not in "fiub":
+            continue
+        if _to_text(cell.attrs.get("MATLAB_class", "")) == "char":
+            continue
+        label = find_label({"Name": _read_text(file[labels[0][k]])}) if labels else ""
+        inner = f"{parent}/{label}" if label else f"{name}/{k + 1}"
+        table.add_array(inner, cell.shape, cell.dtype.kind, (cell.name, ""), group=parent)
+
+
+def _chunk_bytes(item: Any) -> int:
+    size = item.dtype.itemsize
+    for length in item.chunks or ():
+        size *= length
+    return int(size)
+
+
+def _read_text(item: Any) -> str:
+    """Return the text of a char array of MATLAB."""
+    return "".join(map(chr, item[()].reshape(-1)))
+
+
+def _to_text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)

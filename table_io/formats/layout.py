@@ -1,0 +1,242 @@
+"""Layout of a table of text cells: preamble, column names, units, first row of samples.
+
+Laboratory files begin with what their program liked to write: remarks, a line of names, a line of
+units. The samples begin at the first row of numbers that is followed by another of the same width;
+the line above it holds the names, or the units below the names; all above that is preamble. Where
+no row has numbers alone, a column may hold text or times of day.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from table_io.block import Float1D
+from table_io.formats.words import find_unit, is_unit, normalize_unit, read_facts
+
+MAX_HEAD_ROWS = 200  # in which the first row of samples must be
+COMMENT_MARKS = "#%!/;*'"
+CONVERTED_MARK = "# variable "  # begins the remark above the columns of a converted record
+MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which cells are text
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+DAY_S = 86400.0
+CLOCK = re.compile(
+    r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+)?"
+    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+)?))? ?([AP]M)?(?:Z|[-+]\d\d:?\d\d)?",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class TableLayout:
+    """Names and stated units of the columns, index of the first row of samples, stated facts.
+
+    `names` is empty if the file has none; `spare` are names beyond the last column. `kinds` are
+    those of the cells, by `_find_kind`.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    first_row: int
+    kinds: str
+    has_decimal_commas: bool = False
+    spare: tuple[str, ...] = ()
+    samples: int = 0  # rows of samples among the first ones
+    facts: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def width(self) -> int:
+        return len(self.kinds)
+
+    @property
+    def column_names(self) -> list[str]:
+        """The names, or `column 1`, `column 2`, ... of those without one."""
+        names = self.names or ("",) * self.width
+        return [name or f"column {number}" for number, name in enumerate(names, 1)]
+
+
+def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
+    """Find the layout of the first rows of a table of cells; None without a row of samples."""
+    commas = _has_decimal_commas(rows)
+    kinds = ["".join(_find_kind(cell, commas) for cell in _strip_end(row)) for row in rows]
+    filled = [k for k, kind in enumerate(kinds) if kind.strip()]
+    index = _find_numbers(rows, kinds, filled)
+    if index is None:
+        index = _find_samples(kinds, filled)
+    if index is None:
+        return None
+    first = filled.index(index)
+    width = len(kinds[index])
+    rows_below = [kinds[k].ljust(width) for k in filled[first:]]
+    below = [row for row in rows_below if _is_alike(row, kinds[index])]
+    kind = "".join(
+        next((k for k in column if k != " "), " ") for column in zip(*below, strict=True)
+    )
+    names, units, above = _find_names(rows, filled[:first], len(kind))
+    if len(names) == len(rows[index]) == len(kind) + 1:  # a last column whose first cell is empty
+        last = "".join(_find_kind(rows[k][-1], commas) for k in filled[first:] if rows[k])
+        kind, units = kind + last.strip()[:1].ljust(1), (*units, "")
+    units = tuple(
+        unit or find_unit(name) for unit, name in zip(units, names or units, strict=False)
+    )
+    facts = read_facts(" ".join(rows[k]).strip() for k in above)
+    samples = sum(_is_alike(kinds[k].ljust(len(kind)), kind) for k in filled[first:])
+    spare = names[len(kind) :]
+    return TableLayout(names[: len(kind)], units, index, kind, commas, spare, samples, facts)
+
+
+def _find_numbers(
+    rows: Sequence[Sequence[str]], kinds: Sequence[str], filled: Sequence[int]
+) -> int | None:
+    """Return the first row of numbers with another one below it, or names above it."""
+    for place, index in enumerate(filled):
+        below = filled[place + 1 :]
+        if not set(kinds[index]) <= {"n", " "}:
+            continue
+        width = len(kinds[index])
+        if below and set(kinds[below[0]]) <= {"n", " "} and len(kinds[below[0]]) == width:
+            return index
+        if (not place and not below) or (place and _fit_names(rows[filled[place - 1]], width)):
+            return index
+    return None
+
+
+def _find_samples(kinds: Sequence[str], filled: Sequence[int]) -> int | None:
+    """Return the first row with numbers, or times, and text in the same places as those below."""
+    for place, index in enumerate(filled[:-1]):
+        below = filled[place + 1 :]
+        alike = [_is_alike(kinds[index], kinds[k]) for k in below]
+        if (
+            {"n", "c"} & {*kinds[index]}
+            and all(alike[:2])
+            and sum(alike) >= MIN_ALIKE_SHARE * len(below)
+        ):
+            return index
+    return None
+
+
+def _is_alike(first: str, second: str) -> bool:
+    return len(first) == len(second) and all(
+        a == b or " " in (a, b) for a, b in zip(first, second, strict=True)
+    )
+
+
+def _find_names(
+    rows: Sequence[Sequence[str]], above: Sequence[int], width: int
+) -> tuple[tuple[str, ...], tuple[str, ...], Sequence[int]]:
+    """Return (names, units, rows above them) from the filled rows above the samples."""
+    units = ("",) * width
+    place = len(above) - 1
+    while (
+        place > 0 and _is_remark(rows[above[place]]) and not _fit_names(rows[above[place]], width)
+    ):
+        place -= 1
+    names = _fit_names(rows[above[place]], width) if above else ()
+    if not names:
+        return (), units, above
+    rest = above[:place]
+    if all(not name or is_unit(name) for name in names) and any(names):
+        units = tuple(normalize_unit(name) for name in names[:width])
+        names = _fit_names(rows[rest[-1]], width) if rest else ()
+        rest = rest[:-1] if names else rest
+    return names, units, rest
+
+
+def _is_remark(row: Sequence[str]) -> bool:
+    return row[0].lstrip()[:1] in ("#", "%")
+
+
+def _fit_names(row: Sequence[str], width: int) -> tuple[str, ...]:
+    """Return the cells of a row as names of `width` columns; () if they are no such names.
+
+    A name more than columns is that of a last column without cells, such as remarks.
+    """
+    cells = [cell.strip().rstrip(": ") for cell in _strip_end(row)]
+    if row[0].startswith(CONVERTED_MARK):
+        return ()
+    if cells and cells[0] and cells[0][0] in COMMENT_MARKS:
+        first = cells[0].lstrip(COMMENT_MARKS).strip()
+        cells = ([first] if first else []) + cells[1:]
+    if len(cells) > width:  # "disp (mm)" of a table separated by blanks
+        joined: list[str] = []
+        for cell in cells:
+            if joined and cell[:1] in "([":
+                joined[-1] += f" {cell}"
+            else:
+                joined.append(cell)
+        cells = joined
+    if all(is_number(cell) for cell in cells):
+        return ()
+    is_spare = len(cells) == width + 1 > 2 and not any(cell and is_unit(cell) for cell in cells)
+    return tuple(cells) if len(cells) == width or is_spare else ()
+
+
+def _strip_end(row: Sequence[str]) -> Sequence[str]:
+    """Return the row without one empty cell at its end, the mark of a trailing delimiter."""
+    return row[:-1] if len(row) > 1 and not row[-1].strip() else row
+
+
+def _find_kind(cell: str, commas: bool) -> str:
+    """Return the kind of a cell: n number, c time of day, t text, or a blank if it is empty."""
+    text = cell.strip()
+    if not text:
+        return " "
+    if is_number(text.replace(",", ".") if commas else text):
+        return "n"
+    return "c" if CLOCK.fullmatch(text) else "t"
+
+
+def is_number(cell: str) -> bool:
+    """Return True if a cell of a table is a number, with a decimal point if any."""
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
+    """Return True if numbers have decimal commas, and none outside of remarks a decimal point."""
+    filled = [[cell.strip() for cell in row if cell.strip()] for row in rows]
+    numbers = [row for row in filled if all(is_number(cell.replace(",", ".", 1)) for cell in row)]
+    cells = [cell for row in (numbers if any(numbers) else filled) for cell in row]
+    if any("." in cell and is_number(cell) for cell in cells):
+        return False
+    return any(DECIMAL_COMMA.fullmatch(cell) for cell in cells)
+
+
+class ClockReader:
+    """Converter of dates and times of day to seconds since the start of the first day."""
+
+    def __init__(self) -> None:
+        self._first_day: int | None = None
+
+    def __call__(self, cell: str) -> float:
+        """Return the time of a cell in s; NaN if it is empty, ValueError if it is no time."""
+        text = cell.strip()
+        match = CLOCK.fullmatch(text)
+        if match is None:
+            if text:
+                raise ValueError(text)
+            return float("nan")
+        first, mark, second, third, hours, minutes, seconds, half = match.groups()
+        hour = int(hours)
+        if half:
+            hour = hour % 12 + 12 * (half.upper() == "PM")
+        time_s = 3600.0 * hour + 60.0 * int(minutes) + float((seconds or "0").replace(",", "."))
+        if not first:
+            return time_s
+        year, month, day = int(first), int(second), int(third)
+        if len(first) < 3:
+            year, month, day = (day, month, year) if mark == "." else (day, year, month)
+        number = int(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}").astype(int))
+        self._first_day = number if self._first_day is None else self._first_day
+        return time_s + DAY_S * (number - self._first_day)
+
+
+def start_at_zero(times: Float1D) -> Float1D:
+    """Return times of day in s from the first one, (row,), also where they pass midnight."""
+    passed = np.cumsum(np.diff(times, prepend=times[0]) < -0.5 * DAY_S)
+    from_first: Float1D = times + DAY_S * passed - times[0]
+    return np.round(from_first, 9)
