@@ -21,6 +21,7 @@ from twin.exchange.import_table import import_samples
 from twin.log import open_log
 from twin.monitor.panels import draw_limits, draw_twin, format_gaps
 from twin.monitor.run_state import LiveRunState, update_run_state
+from twin.monitor.run_view import RunView, SessionStatus
 from twin.recording.reader import read_recording
 from twin.results.sensor_table import build_sensor_rows
 from twin.rig.predicted_ranges import predict_response
@@ -200,12 +201,13 @@ def test_the_monitor_lists_them(run: Path) -> None:
     for item in items:
         assert item.index >= 0
         state = update_run_state(state, recording.run, item)
-    limits = [line.plain for line in draw_limits(state, 80, 40)]
+    view = RunView(state, SessionStatus())
+    limits = [line.plain for line in draw_limits(view, 80, 40)]
     assert any(line.startswith("mass acc 2") and " g " in line for line in limits)
     assert any(line.startswith("air temp") and "degC" in line for line in limits)
-    twin = [line.plain for line in draw_twin(state, 80, 40)]
+    twin = [line.plain for line in draw_twin(view, 80, 40)]
     assert any(line.startswith("mass acc 2") and "m/s²" in line for line in twin)
-    assert format_gaps(state).plain == "0 dropouts"
+    assert format_gaps(view).plain == "0 dropouts"
 
 
 @pytest.mark.parametrize(
