@@ -11,7 +11,7 @@ from table_io.errors import InputError
 from table_io.records import Comparison, Event, PrcPoint, SampleGap
 from tests.exchange.csv_tables import write_csv
 from tests.input_errors import raises_input_error
-from tests.run.test_unpaced import QUICK, play_run
+from tests.setup.test_unpaced import QUICK, play_run
 from twin.cli.report import print_recording_prc
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import import_samples, print_contents

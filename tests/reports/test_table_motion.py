@@ -14,7 +14,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.tracking import TrackingConfig
 from table_io.units import GRAVITY_M_S2
-from tests.run.test_record import NO_CHECK, RIG, Run, play_run
+from tests.setup.test_record import NO_CHECK, RIG, Run, play_run
 from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording

@@ -19,13 +19,13 @@ import pytest
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.plugin_package import install_package
-from tests.run.clusters import start_cluster, start_quietly
 from tests.sweeps.small_study import (
     STUDY,
     make_stored_study,
     read_stored_bytes,
     write_study,
 )
+from tests.system.clusters import start_cluster, start_quietly
 from twin.api import open_study
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps import command

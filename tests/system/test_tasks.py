@@ -14,8 +14,8 @@ import pytest
 
 from table_io.clock import RealClock
 from tests.input_errors import raises_input_error
-from tests.run import task_functions
-from tests.run.clusters import start_cluster
+from tests.system import task_functions
+from tests.system.clusters import start_cluster
 from twin.setup.folders import find_sharing_problem
 from twin.system.process_pool import TaskResult, Workers, order_results, run_tasks
 from twin.system.versions import read_installed_versions

@@ -1,6 +1,6 @@
 """Random records at extreme scales: whatever the file holds, it is refused, or the limits hold.
 
-    python -m tests.run.random_records FIRST LAST
+    python -m tests.setup.random_records FIRST LAST
 
 draws a record per seed, with its file, unit, scale, similitude, band and baseline, one in three
 with a drive that a wrong twin of the table might have made, and plays what is not refused on the

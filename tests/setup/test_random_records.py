@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.run.random_records import find_faults, play_case
+from tests.setup.random_records import find_faults, play_case
 
 
 @pytest.mark.parametrize("seed", [2, 25, 44])  # the third reaches 0.74 of a limit
