@@ -10,9 +10,14 @@ from rich.text import Text
 from table_io.block import Block
 from table_io.records import Agreement, Estimate, Event, Record, RunStop, Trip
 from tests.monitor.monitored import LEVEL, RUN, block, point, receive, records, start, stream
-from twin.monitor import curves, panels
-from twin.monitor.curves import MIN_MARK_SPACING, PlotCurve, plot_curves
-from twin.monitor.panels import format_number, format_percent
+from twin.monitor import panels
+from twin.monitor.panels import (
+    MIN_MARK_SPACING,
+    PlotCurve,
+    format_number,
+    format_percent,
+    plot_curves,
+)
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.monitor.run_view import RunView, SessionStatus
 from twin.monitor.screen import (
@@ -297,15 +302,15 @@ def test_marks_of_a_curve_keep_their_distance() -> None:
 
 
 def test_prc_grows_with_the_points_of_both_directions() -> None:
-    before = curves.draw_prc(view(start(), point(0)), 60, 16)
-    after = curves.draw_prc(view(start(), point(0), point(9)), 60, 16)
+    before = panels.draw_prc(view(start(), point(0)), 60, 16)
+    after = panels.draw_prc(view(start(), point(0), point(9)), 60, 16)
     assert len(find_dots(after)) > len(find_dots(before)) > 0
     styles = {str(span.style) for line in after for span in line.spans}
-    assert {curves.FORWARD_COLOUR, curves.BACKWARD_COLOUR} <= styles
-    assert curves.BACKWARD_COLOUR not in {str(span.style) for line in before for span in line.spans}
+    assert {panels.FORWARD_COLOUR, panels.BACKWARD_COLOUR} <= styles
+    assert panels.BACKWARD_COLOUR not in {str(span.style) for line in before for span in line.spans}
     assert "●" in "".join(line.plain for line in before)
     lost = view(start(), replace(point(0), measured=None, twin=None))
-    assert not find_dots(curves.draw_prc(lost, 60, 16))
+    assert not find_dots(panels.draw_prc(lost, 60, 16))
 
 
 def test_received_texts_cannot_command_the_terminal() -> None:

@@ -8,10 +8,9 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
-from twin.recording import merge_parts
+from twin.recording import merge
 from twin.recording.mcap_log import LogWriter, iter_messages
-from twin.recording.merge import verify_log
-from twin.recording.merge_parts import LOCK_FILE, merge_run_parts
+from twin.recording.merge import LOCK_FILE, merge_run_parts, verify_log
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.transport.codec import encode_item, topic_for
 
@@ -72,7 +71,7 @@ def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
     kept = part(run, 1, 0, 61, killed=True)
     before = kept.read_bytes()
     with monkeypatch.context() as patch:
-        patch.setattr(merge_parts, "verify_log", lambda _: False)
+        patch.setattr(merge, "verify_log", lambda _: False)
         with raises_input_error(where=run / PARTS_FOLDER / "run.mcap", remedy="shaketwin report"):
             merge_run_parts(run)
     assert not (run / "run.mcap").exists()

@@ -182,13 +182,6 @@ def test_many_damaged_places_cost_no_more_than_the_file_is_long(
     assert sum(searched) < 2048 * damaged
 
 
-def test_the_damage_is_told_by_its_place(content: bytes, tmp_path: Path) -> None:
-    first, end = chunks(content)[3]
-    (tmp_path / "bad.mcap").write_bytes(flip_bit(content, first, end))
-    damage = recover_log(tmp_path / "bad.mcap").damage
-    assert [(damaged.offset, damaged.size) for damaged in damage] == [(first, end - first)]
-
-
 def test_several_accidents_cost_several_chunks(content: bytes, tmp_path: Path) -> None:
     places = chunks(content)
     bad = endless(flip_bit(content, *places[2]), *places[6])

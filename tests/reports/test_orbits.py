@@ -11,7 +11,7 @@ from table_io.config.profile import Profile
 from table_io.records import OrbitPoint, RunStop
 from tests.model.reference import snm
 from tests.reports.recordings import start_record
-from twin.monitor.curves import draw_prc
+from twin.monitor.panels import draw_prc
 from twin.monitor.run_state import LiveRunState
 from twin.monitor.run_view import RunView, SessionStatus
 from twin.recording.mcap_log import write_items

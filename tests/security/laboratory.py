@@ -15,9 +15,10 @@ import zenoh
 from table_io.clock import local_datetime
 from twin.cli.credentials import add_person, create_keys, remove_person
 from twin.live.gateway import validate_command
+from twin.security.access_control import ZenohSettings
 from twin.security.certificate_authority import CertificateKeyPair, issue_certificate
 from twin.security.credentials import read_credentials
-from twin.transport.endpoint import Settings, merge_settings, session_settings
+from twin.transport.endpoint import merge_settings, session_settings
 from twin.transport.zenoh_link import BusLink, open_hub
 
 RIG = "simulated"
@@ -67,7 +68,7 @@ def free_port() -> int:
         return int(free.getsockname()[1])
 
 
-def session(endpoint: str, also: Settings, open_s: float = 2.0) -> Any:
+def session(endpoint: str, also: ZenohSettings, open_s: float = 2.0) -> Any:
     """A client of zenoh's own, which does what ours never would; ZError where it is refused."""
     config = merge_settings(session_settings("client", "connect", endpoint, open_s), also)
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))

@@ -24,10 +24,10 @@ from tests.security.laboratory import (
 )
 from tests.security.laboratory import person as raw_person
 from tests.security.laboratory import session as raw_session
-from twin.security.access_control import build_open_access
+from twin.security.access_control import ZenohSettings, build_open_access
 from twin.security.credentials import read_credentials
 from twin.transport.codec import TOPIC_TYPES
-from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, Settings, key_expression
+from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, key_expression
 from twin.transport.zenoh_link import BusLink, open_spoke
 
 KNOWN = [name for name in PEOPLE if name != "gone"]
@@ -252,7 +252,7 @@ def test_on_this_machine_everybody_asks_and_nobody_publishes(
     closing: ExitStack, twin: bool
 ) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    also: Settings = build_open_access(RIG, remote_twin=twin)
+    also: ZenohSettings = build_open_access(RIG, remote_twin=twin)
     link = closing.enter_context(door(endpoint, extra_settings=also))
     session, false_rig, honest = (raw_session(endpoint, {}) for _ in range(3))
     for peer in (session, false_rig, honest):

@@ -27,6 +27,7 @@ from tests.security.laboratory import (
 )
 from twin.live.control import send_command
 from twin.security import tls_diagnostics as refusal_module
+from twin.security.access_control import ZenohSettings
 from twin.security.certificate_authority import CertificateKeyPair, issue_certificate
 from twin.security.credentials import Credentials, read_credentials
 from twin.security.tls_diagnostics import (
@@ -34,7 +35,6 @@ from twin.security.tls_diagnostics import (
     TOO_MANY_SESSIONS,
     diagnose_refusal,
 )
-from twin.transport.endpoint import Settings
 from twin.transport.zenoh_link import open_hub, open_spoke
 
 SHORT_S = 0.3
@@ -239,7 +239,7 @@ def test_an_order_with_the_role_is_obeyed(doors: Doors) -> None:
 
 
 def test_a_foreign_client_without_a_certificate_is_refused(doors: Doors) -> None:
-    only_authority: Settings = {
+    only_authority: ZenohSettings = {
         "transport": {"link": {"tls": {"root_ca_certificate": str(doors.lab / "ca.pem")}}}
     }
     with pytest.raises(zenoh.ZError):
@@ -264,7 +264,7 @@ def test_a_rig_with_keys_listens_on_every_interface(doors: Doors) -> None:
 
 def test_a_rig_that_is_full_says_so(doors: Doors) -> None:
     endpoint = f"tls/{HERE}:{free_port()}"
-    settings: Settings = {"transport": {"unicast": {"max_sessions": 1}}}
+    settings: ZenohSettings = {"transport": {"unicast": {"max_sessions": 1}}}
     with door(endpoint, extra_settings=settings, keys=read_credentials(doors.lab)):
         first = open_spoke(RIG, endpoint, 5.0, doors.keys())
         with raises_input_error(key="endpoint", value=endpoint, problem=TOO_MANY_SESSIONS.problem):

@@ -110,16 +110,6 @@ def test_every_record_comes_back_to_the_bit(kind: type) -> None:
     law()
 
 
-@given(any_block())
-@settings(max_examples=80)
-def test_every_block_comes_back_to_the_bit(block: Block) -> None:
-    back = return_through_bytes(block)
-    assert isinstance(back, Block)
-    assert back.is_identical(block)
-    assert back.values.shape == block.values.shape
-    assert encode_item(back, "run-7") == encode_item(block, "run-7")
-
-
 def test_what_is_missing_is_not_what_is_empty() -> None:
     none = CycleExtremes(20, 1, 0, 3, 100, None, None)
     zeros = Extremes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), ())

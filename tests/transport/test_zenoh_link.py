@@ -17,14 +17,11 @@ from pathlib import Path
 import pytest
 
 from tests.input_errors import raises_input_error
-from twin.transport import history_cache, reliable_subscriber
-from twin.transport.codec import TOPIC_TYPES
+from twin.transport import reliable_subscriber
 from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, key_expression
 from twin.transport.history_cache import (
-    FRAGMENT_BYTES,
     MAX_CACHED_FRAGMENTS,
     MAX_PAYLOAD_BYTES,
-    HistoryCache,
 )
 from twin.transport.reliable_subscriber import ReliableSubscriber
 from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
@@ -178,22 +175,6 @@ def read_lines(process: "subprocess.Popen[str]", count: int, link: BusLink) -> l
     return lines
 
 
-def test_every_topic_has_a_key_of_its_own() -> None:
-    keys = {topic: key_expression("rig", topic) for topic in TOPIC_TYPES}
-    assert len(set(keys.values())) == len(TOPIC_TYPES)
-    assert keys[MEAS_TOPIC] == "shaketwin/rig/stream/rig/meas"
-    assert keys["/run/start"] == "shaketwin/rig/event/run/start"
-
-
-@pytest.mark.parametrize(
-    "bad", ["", "tcp/127.0.0.1", "127.0.0.1:7447", "tcp/host:0", "tcp/h:70000"]
-)
-def test_a_malformed_endpoint_says_how_to_write_it(bad: str) -> None:
-    for attempt in (lambda: open_hub("rig", bad), lambda: open_spoke("rig", bad, 0.1)):
-        with raises_input_error(key="endpoint", value=bad, allowed="tcp/<host>:<port>"):
-            attempt()
-
-
 def test_a_rig_name_that_is_a_pattern_is_refused(endpoint: str) -> None:
     with raises_input_error(key="rig", value="a/**"):
         open_hub("a/**", endpoint)
@@ -261,51 +242,6 @@ def test_a_late_joiner_gets_what_is_held_while_publishing_goes_on(
     assert inbox.missed == 0
 
 
-def test_without_history_it_begins_now(hub: BusLink, spoke: BusLink) -> None:
-    hub.declare((MEAS_TOPIC, "/run/stop"))
-    hub.publish("/run/stop", number_block(0))
-    publish_at_100_hz(hub, MEAS_TOPIC, range(10))
-    inbox = spoke.subscribe((MEAS_TOPIC, "/run/stop"), history=False, capacity=100)
-    assert fetch(inbox, 1, hub, limit_s=0.7) == []
-    publish_at_100_hz(hub, MEAS_TOPIC, range(10, 20))
-    assert numbers(fetch(inbox, 10, hub), MEAS_TOPIC) == list(range(10, 20))
-
-
-@pytest.mark.parametrize("history", [True, False])
-def test_what_is_lost_on_the_way_is_recovered_in_order(
-    hub: BusLink, spoke: BusLink, history: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    chance = random.Random(1)
-    arrive = ReliableSubscriber.handle_sample
-
-    def lossy(self: ReliableSubscriber, *what: object) -> None:
-        if chance.random() < 0.7:
-            arrive(self, *what)  # type: ignore[arg-type]
-
-    inbox = spoke.subscribe((MEAS_TOPIC,), history=history, capacity=1000)
-    hub.declare((MEAS_TOPIC,))
-    time.sleep(SETTLED_S)
-    hub.publish(MEAS_TOPIC, number_block(0))
-    messages = fetch(inbox, 1, hub)
-    monkeypatch.setattr(ReliableSubscriber, "handle_sample", lossy)
-    publish_at_100_hz(hub, MEAS_TOPIC, range(1, 100))
-    messages += fetch(inbox, 99, hub)
-    assert numbers(messages, MEAS_TOPIC) == list(range(100))
-    assert inbox.missed == 0
-
-
-def test_the_last_message_lost_is_recovered_too(
-    hub: BusLink, spoke: BusLink, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    inbox = spoke.subscribe(("/run/stop",), history=True, capacity=10)
-    hub.declare(("/run/stop",))
-    monkeypatch.setattr(ReliableSubscriber, "handle_sample", lambda *_: None)
-    hub.publish("/run/stop", number_block(0))
-    fetch(inbox, 1, hub, limit_s=0.1)
-    monkeypatch.undo()
-    assert numbers(fetch(inbox, 1, hub), "/run/stop") == [0]
-
-
 def test_a_large_payload_arrives_whole_and_a_larger_one_is_refused(
     hub: BusLink, spoke: BusLink
 ) -> None:
@@ -316,37 +252,6 @@ def test_a_large_payload_arrives_whole_and_a_larger_one_is_refused(
         hub.publish("/run/start", payload)
     assert fetch(inbox, 3, hub, limit_s=2.0) == [("/run/start", largest), ("/run/start", b"")]
     assert hub.rejected == 1
-
-
-def test_a_full_courtesy_inbox_drops_the_oldest_and_counts(hub: BusLink, spoke: BusLink) -> None:
-    inbox = spoke.subscribe((MEAS_TOPIC,), history=False, capacity=10)
-    hub.declare((MEAS_TOPIC,))
-    time.sleep(SETTLED_S)
-    publish_at_100_hz(hub, MEAS_TOPIC, range(50))
-    time.sleep(0.1)
-    assert numbers(fetch(inbox, 50, hub, limit_s=0.7), MEAS_TOPIC) == list(range(40, 50))
-    assert (inbox.dropped, inbox.missed) == (40, 0)
-
-
-def test_a_full_inbox_with_history_loses_nothing(hub: BusLink, spoke: BusLink) -> None:
-    inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
-    hub.declare((MEAS_TOPIC,))
-    publish_at_100_hz(hub, MEAS_TOPIC, range(50))
-    assert numbers(fetch(inbox, 50, hub), MEAS_TOPIC) == list(range(50))
-    assert (inbox.dropped, inbox.missed) == (0, 0)
-
-
-def test_what_is_held_no_more_is_counted_as_missed(
-    hub: BusLink, spoke: BusLink, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(history_cache, "MAX_CACHED_FRAGMENTS", 20)
-    inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=5)
-    hub.declare((MEAS_TOPIC,))
-    hub.publish(MEAS_TOPIC, number_block(0))
-    fetch(inbox, 1, hub)
-    publish_at_100_hz(hub, MEAS_TOPIC, range(1, 51))
-    assert numbers(fetch(inbox, 20, hub), MEAS_TOPIC) == list(range(31, 51))
-    assert inbox.missed == 30
 
 
 @pytest.mark.slow  # 6 s
@@ -454,13 +359,6 @@ def test_whoever_asks_and_stalls_holds_nobody_up_who_answers(
     assert sorted(command.name for command in given) == ["hold", "resume"]
 
 
-def test_an_unreadable_command_is_ignored_and_counted(hub: BusLink, spoke: BusLink) -> None:
-    commands = hub.declare_commands()
-    spoke.send_command("stop", text=b"\xff\xfe", timeout_s=0.1)  # type: ignore[arg-type]
-    assert commands.poll() is None
-    assert commands.ignored == 1
-
-
 def test_foreign_questions_and_messages_do_no_harm(hub: BusLink, spoke: BusLink) -> None:
     hub.declare((MEAS_TOPIC,))
     inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
@@ -501,15 +399,3 @@ print(threading.active_count(), flush=True)
     hub.publish(MEAS_TOPIC, number_block(0))
     assert read_lines(process, 1, hub) == [["1"]]
     assert process.wait(timeout=2.0) == 0
-
-
-def test_a_shelf_holds_the_newest_and_hands_out_what_fits() -> None:
-    held = HistoryCache()
-    for number in range(MAX_CACHED_FRAGMENTS + 10):
-        held.add(number, 3, bytes([number % 256]) * 1000)
-    assert (held.first, held.end) == (10, MAX_CACHED_FRAGMENTS + 10)
-    assert [piece[0] for _, piece in held.collect(20, 3500)] == [20, 21, 22]
-    assert held.collect(held.end, FRAGMENT_BYTES) == []
-    assert held.collect(20, 0) == []
-    held.add(held.end + 5, 3, b"after a gap")
-    assert held.first == held.end - 1

@@ -21,7 +21,7 @@ from tests.viewer.example_run import (
 )
 from twin.viewer import window
 from twin.viewer.address import find_free_address, format_live_view, parse_address, viewer_url
-from twin.viewer.style import BACKGROUND_COLOUR, LINE_STYLES, Rgb
+from twin.viewer.plots import BACKGROUND_COLOUR, LINE_STYLES, Rgb
 from twin.viewer.view import RerunView, write_rrd
 from twin.viewer.window import open_viewer, serve_web_viewer, take_screenshot
 

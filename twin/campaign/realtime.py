@@ -16,7 +16,7 @@ from twin.campaign.messages import (
 from twin.campaign.report import write_campaign_report
 from twin.campaign.state import ActiveCampaign, OperatorAnswer, write_summary_and_report
 from twin.live.supervisor import Supervisor
-from twin.recording.merge_parts import merge_run_parts
+from twin.recording.merge import merge_run_parts
 from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.security.credentials import Credentials, credentials_folder
 from twin.system.progress import RunProgress

@@ -21,8 +21,8 @@ from table_io.errors import InputError
 from twin.campaign import STATE_FILE
 from twin.campaign.config import CampaignPlan, PlannedRun, ResumeMode
 from twin.live.process_config import ProcessConfig
-from twin.recording.merge_parts import LOCK_FILE as PARTS_LOCK_FILE
-from twin.recording.merge_parts import merge_run_parts
+from twin.recording.merge import LOCK_FILE as PARTS_LOCK_FILE
+from twin.recording.merge import merge_run_parts
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.report.report import write_report

@@ -53,7 +53,7 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
-    from twin.recording.merge_parts import merge_run_parts
+    from twin.recording.merge import merge_run_parts
     from twin.recording.run_paths import PARTS_FOLDER
     from twin.report.report import load_report_data, write_report
 

@@ -63,8 +63,7 @@ from twin.transport.endpoint import (
 )
 from twin.transport.history_cache import Fragment
 from twin.transport.reliable_subscriber import ReliableSubscriber
-from twin.transport.requests import Request, RequestQueue
-from twin.transport.zenoh_link import BusLink, open_hub, open_spoke
+from twin.transport.zenoh_link import BusLink, Request, RequestQueue, open_hub, open_spoke
 
 log = logging.getLogger(__name__)
 GATEWAY_NICENESS = 5  # observers yield processor time to the rig and the twin

@@ -12,7 +12,7 @@ from twin.live.control import find_run
 from twin.live.process_config import INBOX_CAPACITY, MAX_QUIET_S, ProcessConfig
 from twin.live.recorder import FLUSH_INTERVAL_S, SYNC_INTERVAL_S, CompletionTracker
 from twin.recording.mcap_log import LogTimeError, LogWriter
-from twin.recording.merge_parts import LOCK_FILE, merge_run_parts
+from twin.recording.merge import LOCK_FILE, merge_run_parts
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.security.access_control import user_name

@@ -37,8 +37,7 @@ from twin.setup.run_config import compile_rig_kernels
 from twin.system.diagnostics import configure_logging
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX
-from twin.transport.requests import RequestQueue
-from twin.transport.zenoh_link import open_hub, open_spoke
+from twin.transport.zenoh_link import RequestQueue, open_hub, open_spoke
 
 log = logging.getLogger("twin.live.processes")  # not __main__, as which it runs
 RIG_PRIORITY = 50  # real-time scheduling priority, if permitted

@@ -21,7 +21,7 @@ from twin.live.process_config import (
     process_token,
 )
 from twin.recording.mcap_log import LogTimeError, LogWriter
-from twin.recording.merge_parts import LOCK_FILE
+from twin.recording.merge import LOCK_FILE
 from twin.setup.disk import RESERVE_S, DiskForecast, DiskReserve, bytes_per_s, free_bytes
 from twin.system.files import lock_file
 from twin.transport.codec import TOPIC_TYPES, Item, WireError, decode_item, encode_item, topic_for

@@ -13,8 +13,7 @@ from twin.system.terminal import print_line
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, merge_settings
 from twin.transport.history_cache import MAX_CACHED_FRAGMENTS
-from twin.transport.requests import Request
-from twin.transport.zenoh_link import BusLink, open_hub
+from twin.transport.zenoh_link import BusLink, Request, open_hub
 
 MAX_LEAD_FRAGMENTS = MAX_CACHED_FRAGMENTS * 4 // 5  # of a topic, ahead of the slowest subscriber
 POLL_INTERVAL_S = 0.002

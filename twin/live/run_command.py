@@ -104,7 +104,7 @@ def _run_live(
     """Run a test in real time; return False if it was interrupted before it began."""
     from twin.live.process_config import ProcessConfig
     from twin.live.supervisor import Supervisor
-    from twin.recording.merge_parts import merge_run_parts
+    from twin.recording.merge import merge_run_parts
 
     process_config = ProcessConfig(
         run,

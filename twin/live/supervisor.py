@@ -16,7 +16,7 @@ from table_io.config.profile import OnDeathConfig
 from table_io.errors import InputError
 from table_io.records import Comparison, Event, Fault, RunStop, Timing
 from twin.live.process_config import ProcessConfig, process_token
-from twin.recording.merge_parts import LOCK_FILE
+from twin.recording.merge import LOCK_FILE
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.system.files import lock_file
 from twin.system.temporary_folders import SOCKET_PREFIX, make_private_folder

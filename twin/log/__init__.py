@@ -32,6 +32,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Block, Float1D, Float2D, Int1D, Label
 from table_io.channels import RELATIVE_DISP_SOURCES, Channel, list_derived_channels
@@ -351,14 +352,14 @@ class Log:
         return StepView(step, point, cycles, self, slice(int(inside[0]), int(inside[-1]) + 1))
 
     @cached_property
-    def prc(self) -> dict[str, Any]:
+    def prc(self) -> dict[str, npt.NDArray[Any]]:
         """Pseudo-resonance curves as arrays (point,).
 
         Keys: step, direction, frequency_hz; eta_d, ... measured; twin_eta_d, ... of the twin. NaN
         where a value is missing.
         """
         points = self.points
-        curves: dict[str, Any] = {
+        curves: dict[str, npt.NDArray[Any]] = {
             name: np.array([getattr(point, name) for point in points])
             for name in ("step", "direction", "frequency_hz")
         }

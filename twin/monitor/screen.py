@@ -8,7 +8,7 @@ import numpy as np
 from rich.text import Text
 
 from table_io.errors import replace_nonprintable
-from twin.monitor import curves, panels
+from twin.monitor import panels
 from twin.monitor.panels import DIM_STYLE, GOOD_STYLE, STYLES, WARN_STYLE, draw_bar
 from twin.monitor.run_view import Progress, RunView, SessionStatus, eta_a, format_duration
 from twin.viewer.view_model import impacts_per_cycle
@@ -37,8 +37,8 @@ class Panel:
 
 
 PRC_LEGEND = (
-    f" [{curves.FORWARD_COLOUR}]━ forward[/] [{curves.BACKWARD_COLOUR}]━ backward[/]"
-    f" [{curves.TWIN_COLOUR}]○ twin[/]"
+    f" [{panels.FORWARD_COLOUR}]━ forward[/] [{panels.BACKWARD_COLOUR}]━ backward[/]"
+    f" [{panels.TWIN_COLOUR}]○ twin[/]"
 )
 LEVEL_PANEL = Panel("Level", panels.draw_level, 3, 3)
 LIMITS_PANEL = Panel("Margins to limits, peak of 1 s", panels.draw_limits, 3, 12)
@@ -46,11 +46,11 @@ TWIN_PANEL = Panel("Measured | twin", panels.draw_twin, 8, 8)
 PHASES_PANEL = Panel("Error of the last cycle by phase", panels.draw_phases, 8, 8)
 SPECIMEN_PANEL = Panel("Identified parameters", panels.draw_specimen, 1, 7)
 TIMING_PANEL = Panel("Latency in ms", panels.draw_timing, 4, 8)
-ETA_D_PANEL = Panel("PRC η_d", curves.draw_prc, 8, 20, is_growing=True, legend=PRC_LEGEND)
-ETA_A_PANEL = Panel("PRC η_a", partial(curves.draw_prc, value=eta_a), 8, 20, is_growing=True)
+ETA_D_PANEL = Panel("PRC η_d", panels.draw_prc, 8, 20, is_growing=True, legend=PRC_LEGEND)
+ETA_A_PANEL = Panel("PRC η_a", partial(panels.draw_prc, value=eta_a), 8, 20, is_growing=True)
 IMPACT_RATE_PANEL = Panel(
     "Impacts per cycle, R + L",
-    partial(curves.draw_prc, value=impacts_per_cycle),
+    partial(panels.draw_prc, value=impacts_per_cycle),
     8,
     16,
     is_growing=True,

@@ -15,6 +15,7 @@ from tempfile import TemporaryFile
 from typing import IO, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Block, Float1D, Float2D, Int1D
 from table_io.channels import (
@@ -42,7 +43,7 @@ SCRATCH_COLUMNS = ("index", "step", "label", "cycle")  # before the channels of 
 KEPT_RECORDS = (RunStop, Event, PrcPoint, StepAdded)
 MAX_LATENESS_S = 1.0  # of a message after later ones, in a log that can be read in order
 WINDOW_ROWS = 2**14  # rows read at once
-Columns = dict[str, Any]  # arrays (row,), float64 or int64
+Columns = dict[str, npt.NDArray[Any]]  # (row,) each, float64 or int64
 
 
 @dataclass(eq=False)

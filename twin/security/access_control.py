@@ -22,10 +22,9 @@ connects with the rig's certificate and, like a router, forwards commands of tho
 import getpass
 import re
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from twin.security.credentials import Credentials
+ZenohSettings = dict[str, Any]  # nested, as zenoh reads them from JSON
 
 ROUTER_ROLE = "router"
 ROLES = ("observe", "record", "twin", "command", ROUTER_ROLE)
@@ -70,7 +69,7 @@ RIG_RULES: tuple[Rule, ...] = (
 )
 
 
-def build_people_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
+def build_people_access(rig: str, people: Mapping[str, str]) -> ZenohSettings:
     """Return zenoh's access settings of the rig's hub; `people` maps common name to role."""
     return _to_zenoh_settings(
         rig,
@@ -81,7 +80,7 @@ def build_people_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
     )
 
 
-def build_router_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
+def build_router_access(rig: str, people: Mapping[str, str]) -> ZenohSettings:
     """Return zenoh's access settings of a router between the rig and these people.
 
     The router checks clients as the rig does. Otherwise each client behind it could publish to the
@@ -93,7 +92,7 @@ def build_router_access(rig: str, people: Mapping[str, str]) -> dict[str, Any]:
     )
 
 
-def build_open_access(rig: str, *, remote_twin: bool = False) -> dict[str, Any]:
+def build_open_access(rig: str, *, remote_twin: bool = False) -> ZenohSettings:
     """Return zenoh's access settings of a loopback hub: every client may query and command.
 
     No client may publish or reply in the rig's name; `remote_twin` allows offers of a twin.
@@ -122,11 +121,11 @@ def _own_rules(name: str) -> tuple[Rule, ...]:
     )
 
 
-def _to_zenoh_settings(rig: str, grants: Iterable[Grant]) -> dict[str, Any]:
+def _to_zenoh_settings(rig: str, grants: Iterable[Grant]) -> ZenohSettings:
     """Convert grants to zenoh's rules, subjects and policies."""
-    zenoh_rules: list[dict[str, Any]] = []
-    subjects: list[dict[str, Any]] = []
-    policies: list[dict[str, Any]] = []
+    zenoh_rules: list[ZenohSettings] = []
+    subjects: list[ZenohSettings] = []
+    policies: list[ZenohSettings] = []
     for subject, names, rules in grants:
         if names == []:
             continue  # zenoh rejects an empty list and reads an absent one as all clients
@@ -141,7 +140,15 @@ def _to_zenoh_settings(rig: str, grants: Iterable[Grant]) -> dict[str, Any]:
     return {"access_control": base | lists}
 
 
-def user_name(keys: "Credentials | None") -> str:
+class NamedKeys(Protocol):
+    """Keys of a person or of the rig, as `Credentials`."""
+
+    @property
+    def name(self) -> str:
+        """Common name of the certificate."""
+
+
+def user_name(keys: NamedKeys | None) -> str:
     """Return the name in the certificate; without keys the login name on this machine."""
     if keys is not None:
         return keys.name

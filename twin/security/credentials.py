@@ -19,14 +19,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import AfterValidator
 
 from table_io.clock import local_datetime
 from table_io.config.base import ConfigModel, parse_toml, read_text
 from table_io.errors import InputError
-from twin.security.access_control import NO_ROLE, RIG_NAME, ROUTER_ROLE, build_people_access
+from twin.security.access_control import (
+    NO_ROLE,
+    RIG_NAME,
+    ROUTER_ROLE,
+    ZenohSettings,
+    build_people_access,
+)
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
     "ca.pem",
@@ -89,7 +95,7 @@ class Credentials:
         """Whole days until the certificate expires."""
         return (self.valid_until - local_datetime()).days
 
-    def tls_settings(self) -> dict[str, Any]:
+    def tls_settings(self) -> ZenohSettings:
         """Return zenoh's settings for mutual TLS with certificates of this authority."""
         certificate, key = str(self.folder / CERTIFICATE_FILE), str(self.folder / KEY_FILE)
         tls = {
@@ -104,7 +110,7 @@ class Credentials:
         }
         return {"transport": {"link": {"tls": tls, "protocols": ["tls"]}}}
 
-    def access_settings(self, rig: str) -> dict[str, Any]:
+    def access_settings(self, rig: str) -> ZenohSettings:
         """Return zenoh's access-control settings of the rig's hub."""
         return build_people_access(rig, self.people or {})
 

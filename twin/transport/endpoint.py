@@ -3,11 +3,9 @@
 import re
 import socket
 from collections.abc import Iterable
-from typing import Any
 
 from table_io.errors import InputError
-
-Settings = dict[str, Any]
+from twin.security.access_control import ZenohSettings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"  # at which observers reach a test
 MEAS_TOPIC = "/rig/meas"
@@ -38,7 +36,7 @@ MAX_RATES_HZ = {
     **{f"cmd/{order}/*": MAX_COMMAND_HZ for order in ("hold", "resume", "stop", "abort")},
 }
 # Limits of the public hub, enforced by zenoh: excess messages are dropped.
-PUBLIC_HUB_SETTINGS: Settings = {
+PUBLIC_HUB_SETTINGS: ZenohSettings = {
     "transport": {
         "unicast": {
             "max_sessions": MAX_SESSIONS + MAX_CLOSING_SESSIONS,
@@ -181,7 +179,7 @@ def _address_family(host: str) -> socket.AddressFamily:
     return socket.AF_INET6 if ":" in host else socket.AF_INET
 
 
-def session_settings(mode: str, action: str, endpoint: str, timeout_s: float) -> Settings:
+def session_settings(mode: str, action: str, endpoint: str, timeout_s: float) -> ZenohSettings:
     """Return zenoh settings of a session with one endpoint, no scouting, and dropping queues."""
     endpoint_settings = {
         "endpoints": [endpoint],
@@ -206,7 +204,7 @@ def session_settings(mode: str, action: str, endpoint: str, timeout_s: float) ->
     }
 
 
-def router_settings(router: str) -> Settings:
+def router_settings(router: str) -> ZenohSettings:
     """Return zenoh settings that also connect a hub to a router, retrying for ever."""
     retry = {"period_init_ms": 500, "period_max_ms": 2000, "period_increase_factor": 2}
     return {
@@ -219,7 +217,7 @@ def router_settings(router: str) -> Settings:
     }
 
 
-def merge_settings(settings: Settings, overrides: Settings) -> Settings:
+def merge_settings(settings: ZenohSettings, overrides: ZenohSettings) -> ZenohSettings:
     """Merge nested settings; values of `overrides` win."""
     combined = settings | overrides
     for key in settings.keys() & overrides.keys():

@@ -1,11 +1,12 @@
 """Publisher-side history cache: sequence-numbered fragments for retransmission."""
 
+import json
 import struct
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from table_io.clock import RealClock
 
@@ -18,7 +19,9 @@ MAX_SUBSCRIBERS = 256  # whose progress a publisher tracks
 PUBLISHER_TIMEOUT_S = 10.0  # zenoh's lease: after it a silent publisher counts as dead
 FRAGMENT_HEADER = struct.Struct("<8sQB")  # publisher id, sequence number, flags
 FIRST_FLAG, LAST_FLAG = 1, 2  # fragment begins, ends its payload
+MAX_HISTORY_QUERY_BYTES = 16 * 2**10  # it names the publishers of every topic
 CLOCK = RealClock()
+T = TypeVar("T")
 
 
 class Fragment(NamedTuple):
@@ -85,6 +88,44 @@ HistoryCaches = dict[tuple[str, str], HistoryCache]  # by topic and publisher
 NextSequences = dict[str, dict[str, int]]  # next sequence number needed, by topic and publisher
 
 
+class HistoryQuery(NamedTuple):
+    """Question of a subscriber for the fragments that it needs next, with or without history."""
+
+    who: str  # id of the subscriber
+    history: bool
+    next: NextSequences
+
+    def encode(self) -> str:
+        """Return the query as JSON, as `parse_history_query` takes it."""
+        return json.dumps(self._asdict())
+
+
+def parse_request(text: bytes, max_bytes: int, convert: Callable[[Any], T]) -> T | None:
+    """Parse and convert untrusted JSON; return None where it is invalid.
+
+    Invalid is: longer than `max_bytes`, not JSON, nested too deeply, or rejected by `convert`.
+    """
+    if len(text) > max_bytes:
+        return None
+    try:
+        return convert(json.loads(text))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError):
+        return None
+
+
+def parse_history_query(text: bytes) -> HistoryQuery | None:
+    """Return a history query as `ReliableSubscriber` sends it, None if it is invalid."""
+
+    def convert(data: Any) -> HistoryQuery:
+        next_sequences = {
+            topic: {str(publisher): int(sequence) for publisher, sequence in sequences.items()}
+            for topic, sequences in data["next"].items()
+        }
+        return HistoryQuery(str(data.get("who"))[:64], bool(data["history"]), next_sequences)
+
+    return parse_request(text, MAX_HISTORY_QUERY_BYTES, convert)
+
+
 def build_history_reply(
     caches: HistoryCaches, next_sequences: NextSequences, history: bool
 ) -> tuple[list[Any], bytes]:
@@ -128,20 +169,20 @@ class SubscriberProgress:
 
     positions: dict[str, tuple[float, dict[tuple[str, str], int]]] = field(default_factory=dict)
 
-    def record_query(self, query: dict[str, Any], caches: HistoryCaches) -> None:
+    def record_query(self, query: HistoryQuery, caches: HistoryCaches) -> None:
         """Record a history query; a subscriber without history starts at the end of the cache."""
-        history, subscriber = query["history"], query["who"]
-        previous = self.positions.pop(subscriber, (0.0, {}))[1]
+        previous = self.positions.pop(query.who, (0.0, {}))[1]
         positions = {}
         for (topic, publisher), cache in caches.items():
-            if topic in query["next"]:
-                default_sequence = previous.get((topic, publisher), 0 if history else cache.end)
-                sequence = query["next"][topic].get(publisher, default_sequence)
+            if topic in query.next:
+                start = 0 if query.history else cache.end
+                default_sequence = previous.get((topic, publisher), start)
+                sequence = query.next[topic].get(publisher, default_sequence)
                 # clamped: the number comes from outside
                 positions[topic, publisher] = min(max(sequence, cache.first), cache.end)
         while len(self.positions) >= MAX_SUBSCRIBERS:
             del self.positions[next(iter(self.positions))]  # least recent query
-        self.positions[subscriber] = CLOCK.now(), positions
+        self.positions[query.who] = CLOCK.now(), positions
 
     def max_lag(self, caches: HistoryCaches, within_s: float = PUBLISHER_TIMEOUT_S) -> int:
         """Return the largest lag in fragments of the subscribers seen within `within_s`, or 0."""

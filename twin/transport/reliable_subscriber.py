@@ -21,8 +21,9 @@ from twin.transport.history_cache import (
     MAX_PAYLOAD_BYTES,
     PUBLISHER_TIMEOUT_S,
     Fragment,
+    HistoryQuery,
+    parse_request,
 )
-from twin.transport.requests import parse_request
 
 QUERY_PERIOD_S = 0.5  # without a known gap, in case the last message of a topic was lost
 QUERY_RETRY_S = 0.1  # with a gap, in case query or reply was lost
@@ -39,7 +40,7 @@ class QueryLink(Protocol):
     def serve(self) -> bool:
         """Answer one pending history query; return whether there was one."""
 
-    def query_history(self, question: dict[str, Any], inbox: "ReliableSubscriber") -> None:
+    def query_history(self, query: HistoryQuery, inbox: "ReliableSubscriber") -> None:
         """Send a history query to all publishers; replies arrive in `inbox`."""
 
 
@@ -272,9 +273,8 @@ class ReliableSubscriber:
             for (topic, publisher), state in self._positions.items():
                 if state.next_sequence is not None:
                     next_sequences[topic][publisher] = state.next_sequence
-            self._link.query_history(
-                {"who": self._subscriber_id, "history": self._history, "next": next_sequences}, self
-            )
+            query = HistoryQuery(self._subscriber_id, self._history, next_sequences)
+            self._link.query_history(query, self)
 
 
 def _check_entry(

@@ -23,15 +23,17 @@ publisher that keeps publishing.
 
 import json
 import secrets
+from collections import deque
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import zenoh
 
 from table_io.clock import RealClock
+from twin.security.access_control import ZenohSettings
 from twin.transport.endpoint import (
     LOCAL_SOCKET_PREFIX,
     OBSERVER_PREFIX,
-    Settings,
     check_endpoint,
     history_query_path,
     key_expression,
@@ -50,18 +52,13 @@ from twin.transport.history_cache import (
     Fragment,
     HistoryCache,
     HistoryCaches,
+    HistoryQuery,
     SubscriberProgress,
     build_history_reply,
+    parse_history_query,
     split_payload,
 )
 from twin.transport.reliable_subscriber import QUERY_PERIOD_S, ReliableSubscriber
-from twin.transport.requests import (
-    MAX_HISTORY_QUERY_BYTES,
-    Request,
-    RequestQueue,
-    parse_history_query,
-    parse_request,
-)
 from twin.transport.session_limits import SessionLimiter
 
 if TYPE_CHECKING:
@@ -70,7 +67,67 @@ if TYPE_CHECKING:
 # A reply inherits the congestion control of its query: the rig never waits for a stalled requester.
 DROP = zenoh.CongestionControl.DROP
 MAX_WAITING_QUERIES = 64
+MAX_REQUEST_BYTES = 4096
 MAX_OBSERVERS = 256  # tracked at once; the run's own components are always tracked
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Pending request; its sender gets no answer unless `reply` is called.
+
+    `path` is the key after shaketwin/<rig>/, for example cmd/stop.
+    """
+
+    path: str
+    text: str
+    _key: str = field(repr=False)
+    _query: Any = field(repr=False)
+
+    @property
+    def name(self) -> str:
+        """Last part of the path."""
+        return self.path.rsplit("/", 1)[1]
+
+    def reply(self, body: str | bytes) -> None:
+        """Send the answer; call it once."""
+        with self._query as query:
+            query.reply(self._key, body)
+
+
+class RequestQueue:
+    """Requests to this process, polled without a thread.
+
+    They wait in zenoh's ring buffers, which drop the oldest. `ignored` counts malformed requests.
+    """
+
+    def __init__(self, link: "BusLink", root: str, queryables: dict[str, Any]) -> None:
+        self.ignored = 0
+        self._link = link
+        self._root = root
+        self._queryables = deque(queryables.items())
+
+    def poll(self) -> Request | None:
+        """Return the next request, or None without waiting; also answer a history query."""
+        self._link.serve()
+        for _ in range(len(self._queryables)):
+            self._queryables.rotate()  # so that a flood on one key does not starve the others
+            path, queryable = self._queryables[0]
+            while (query := queryable.try_recv()) is not None:
+                # a query with a wildcard is answered under each key that it matches
+                requested_path = (
+                    path if "*" not in path else str(query.key_expr).removeprefix(self._root)
+                )
+                payload = b"" if query.payload is None else query.payload.to_bytes()
+                try:
+                    if len(payload) <= MAX_REQUEST_BYTES and "*" not in requested_path:
+                        return Request(
+                            requested_path, payload.decode(), self._root + requested_path, query
+                        )
+                except UnicodeDecodeError:
+                    pass
+                self.ignored += 1
+                query.drop()
+        return None
 
 
 class BusLink:
@@ -132,11 +189,11 @@ class BusLink:
             return False
         with query:
             text = b"" if query.payload is None else query.payload.to_bytes()
-            history_query = parse_request(text, MAX_HISTORY_QUERY_BYTES, parse_history_query)
+            history_query = parse_history_query(text)
             if history_query is None:
                 return True  # malformed: no reply
             entries, chunk = build_history_reply(
-                self._caches, history_query["next"], history_query["history"]
+                self._caches, history_query.next, history_query.history
             )
             self.subscriber_progress.record_query(history_query, self._caches)
             if entries:
@@ -147,7 +204,7 @@ class BusLink:
         """Return the largest lag in fragments of the subscribers seen within `within_s`."""
         return self.subscriber_progress.max_lag(self._caches, within_s)
 
-    def query_history(self, query: dict[str, Any], inbox: ReliableSubscriber) -> None:
+    def query_history(self, query: HistoryQuery, inbox: ReliableSubscriber) -> None:
         """Send a history query to all publishers; replies arrive in `inbox`. Never blocks."""
 
         def on_reply(reply: Any) -> None:
@@ -157,7 +214,7 @@ class BusLink:
         self._session.get(
             f"shaketwin/{self._rig}/{history_query_path(offered=inbox.offered)}",
             zenoh.handlers.Callback(on_reply, indirect=False),
-            payload=json.dumps(query),
+            payload=query.encode(),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=DROP,
@@ -294,7 +351,7 @@ class BusLink:
 def open_hub(
     rig: str,
     endpoint: str,
-    extra_settings: Settings | None = None,
+    extra_settings: ZenohSettings | None = None,
     keys: "Credentials | None" = None,
 ) -> BusLink:
     """Open the hub, listening at `endpoint`; raise InputError if that fails.
@@ -349,5 +406,5 @@ def open_spoke(
     return link
 
 
-def _open_session(config: Settings) -> Any:
+def _open_session(config: ZenohSettings) -> Any:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(config)))

@@ -7,18 +7,19 @@ import rerun.blueprint as rrb
 
 from table_io.channels import CHANNEL_BY_NAME
 from table_io.records import RunStart
-from twin.viewer.plots import PLANE_WIDTH, PRC_WIDTH
-from twin.viewer.scene import HALF_MASS, Scene
-from twin.viewer.sink import RerunSink
-from twin.viewer.style import (
+from twin.viewer.plots import (
     BACKGROUND_COLOUR,
     CONTACT_COLOUR,
     DARK_GREY,
     LINE_STYLES,
+    PLANE_WIDTH,
+    PRC_WIDTH,
     RED,
     TEAL,
     WHITE,
 )
+from twin.viewer.scene import HALF_MASS, Scene
+from twin.viewer.sink import RerunSink
 
 WINDOW_S, LEGEND_S = 5.0, 1.5  # of a sliding time series: visible span, and space for the legend
 TRAIL_S = 2.0

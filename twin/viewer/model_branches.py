@@ -19,7 +19,7 @@ from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
 from twin.model.stepped_sine import EXTREME_NAMES
-from twin.viewer.style import GREY, Rgb
+from twin.viewer.plots import GREY, Rgb
 
 MAX_MISMATCH = 0.3  # of the amplitude: farther from the measured motion a branch is another one
 DASH_SHARE = 0.012  # of the height of the plot: length of the dashes of an unstable branch

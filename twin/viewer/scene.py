@@ -15,8 +15,14 @@ from table_io.config.excitation import ExcitationPlan
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
 from twin.viewer.motion import BlockMotion
-from twin.viewer.plots import nice_floor
-from twin.viewer.style import CONTACT_COLOUR, IDLE_COLOUR, MASS_COLOUR, RUBBER_COLOUR, STEEL_COLOUR
+from twin.viewer.plots import (
+    CONTACT_COLOUR,
+    IDLE_COLOUR,
+    MASS_COLOUR,
+    RUBBER_COLOUR,
+    STEEL_COLOUR,
+    nice_floor,
+)
 
 Float3D = npt.NDArray[np.float64]
 Colours = npt.NDArray[np.uint8]

@@ -16,9 +16,8 @@ from table_io.block import Float2D, Int1D
 from table_io.errors import InputError
 from table_io.records import RunStart
 from twin.viewer.address import parse_address
-from twin.viewer.plots import PlotAxes
+from twin.viewer.plots import DARK_GREY, GREY, LineStyle, PlotAxes, Rgb
 from twin.viewer.scene import BoxFrames, Float3D
-from twin.viewer.style import DARK_GREY, GREY, LineStyle, Rgb
 
 SERVER_MEMORY_LIMIT = "256MiB"  # history for late viewers; the oldest data are dropped first
 MAX_FOOTER_S = 1200.0
