@@ -8,9 +8,8 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from tests.recording.test_mcap_log import run, write
-from twin.replay import repair
-from twin.replay.repair import write_repaired
-from twin.replay.verify import Verification, examine_logs
+from twin.replay import verify
+from twin.replay.verify import Verification, examine_logs, write_repaired
 
 
 @pytest.fixture
@@ -35,7 +34,7 @@ def test_a_full_disk_leaves_no_half_of_a_file(
             write_repaired(verified, [old], new)
     assert not new.exists()
     write_repaired(verified, [old], new)
-    assert examine_logs([new]).report["damage"] == []
+    assert examine_logs([new]).report.damage == []
 
 
 def test_what_failed_first_is_told(
@@ -65,7 +64,7 @@ def test_one_that_reads_back_as_another_is_not_left(
         again = examine_logs(paths)
         return Verification(again.recording, again.messages[1:], again.report)
 
-    monkeypatch.setattr(repair, "examine_logs", forgetful)
+    monkeypatch.setattr(verify, "examine_logs", forgetful)
     with raises_input_error(where=new, remedy=str(old)):
         write_repaired(verified, [old], new)
     assert not new.exists()

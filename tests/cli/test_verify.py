@@ -308,6 +308,6 @@ def test_what_is_left_after_any_accident_can_be_repaired(log: Path) -> None:
         with suppress(InputError):
             verify(bad, "--repair", new)
             made += 1
-            assert examine_logs([new]).report["damage"] == []
+            assert examine_logs([new]).report.damage == []
             assert recover_log(new).is_intact
     assert made > 6

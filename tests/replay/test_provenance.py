@@ -13,7 +13,7 @@ from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
-from twin.replay.verify import examine_logs, verify_logs
+from twin.replay.verify import ReplayOutlook, examine_logs, verify_logs
 from twin.report.finalize import EXIT_NOT_IDENTICAL
 from twin.setup.run_config import RunConfig
 from twin.system.versions import read_installed_versions
@@ -84,12 +84,8 @@ def test_some_steps_are_a_sound_recording(some_steps: Recording, recording: Reco
     assert notes(some_steps, "cut") == [f"from {recording.run} at sample {first}"]
     assert verify_logs([some_steps.path], False, None) == 0
     report = examine_logs([some_steps.path]).report
-    assert (report["gaps"], report["damage"], report["sound"]) == ([], [], True)
-    assert report["replay"] == {
-        "possible": True,
-        "identical": False,
-        "because": [f"its beginning is in {recording.run}"],
-    }
+    assert (report.gaps, report.damage, report.sound) == ([], [], True)
+    assert report.replay == ReplayOutlook(True, False, [f"its beginning is in {recording.run}"])
 
 
 def test_a_gap_before_the_first_of_some_steps_is_one(some_steps: Recording, tmp_path: Path) -> None:
@@ -97,8 +93,8 @@ def test_a_gap_before_the_first_of_some_steps_is_one(some_steps: Recording, tmp_
     write_items(tmp_path / "a.mcap", [
         item for item in some_steps.items if item.index != first or item is some_steps.start
     ], some_steps.start)  # fmt: skip
-    (gap,) = examine_logs([tmp_path / "a.mcap"]).report["gaps"]
-    assert gap["first"] == first
+    (gap,) = examine_logs([tmp_path / "a.mcap"]).report.gaps
+    assert gap.first == first
 
 
 def test_some_steps_replayed_are_not_said_to_differ(

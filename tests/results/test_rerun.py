@@ -139,11 +139,11 @@ def test_a_changed_hash_or_block_is_found(
 
 def test_verify_says_what_is_recorded(sparse_log: Path, log_file: Path) -> None:
     sparse, full = (examine_logs([path]).report for path in (sparse_log, log_file))
-    assert (sparse["predictions"]["every"], full["predictions"]["every"]) == (10, 1)
-    assert sparse["predictions"]["hashed"] == full["predictions"]["hashed"]
-    assert sparse["predictions"]["recorded"] < 0.11 * full["predictions"]["recorded"]
-    assert sparse["sound"]
-    assert sparse["replay"]["identical"]
+    assert (sparse.predictions.every, full.predictions.every) == (10, 1)
+    assert sparse.predictions.hashed == full.predictions.hashed
+    assert sparse.predictions.recorded < 0.11 * full.predictions.recorded
+    assert sparse.sound
+    assert sparse.replay.identical
 
 
 @pytest.mark.parametrize("size", [1, 7, 20, 200, 999])
