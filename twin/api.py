@@ -25,7 +25,7 @@ from twin.discovery.identify import identify_parameters
 from twin.discovery.loading import load_logs, load_recordings
 from twin.discovery.parameters import get_log
 from twin.discovery.serialize import model_to_toml, parameter_to_json, verdict_to_json
-from twin.exchange.import_table import ImportOptions, import_samples
+from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import find_effect
 from twin.log import Log, open_log
 from twin.replay.pipeline_replay import RecordedRun, SampleRange, replay_recording
@@ -126,14 +126,12 @@ def import_data(
     channels are in the log's events. `profile` states specimen, gaps and steps. InputError where
     the file leaves a question open, or `out` exists.
     """
-    import_samples(
-        Path(file),
-        Path(out),
-        None if profile is None else resolve_config(Path(profile), "tests"),
-        None,
-        None if columns is None else Path(columns),
-        ImportOptions(accept=columns is None),
+    options = ImportOptions(
+        profile=None if profile is None else resolve_config(Path(profile), "tests"),
+        columns=None if columns is None else Path(columns),
+        accept=columns is None,
     )
+    import_table(Path(file), Path(out), options)
     return open_log(out)
 
 

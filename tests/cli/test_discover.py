@@ -25,7 +25,7 @@ from twin.discovery.identify_command import identify_command
 from twin.discovery.loading import load_logs
 from twin.discovery.selection import Cancelled
 from twin.discovery.serialize import REFITTED_SUFFIX
-from twin.exchange.import_table import import_samples
+from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
 from twin.report.finalize import EXIT_INTERRUPTED
@@ -98,7 +98,7 @@ def change_log(source: Made, folder: Path, change: Callable[[str, Float1D], Floa
     rows = np.array([piece.time_s, *columns]).T
     head = ",".join(["time_s", *piece.channels])
     np.savetxt(table, rows, fmt="%.9g", delimiter=",", header=head, comments="")
-    import_samples(table, log, source.profile, None, None)
+    import_table(table, log, ImportOptions(profile=source.profile))
     return log
 
 

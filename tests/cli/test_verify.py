@@ -21,8 +21,8 @@ from table_io.clock import ManualClock
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop, SampleGap
 from tests.cli.test_cli import SHORT
-from tests.exchange.mutants import damage, spans, whole
 from tests.input_errors import raises_input_error
+from tests.recording.mutants import damage, spans, whole
 from twin.cli.main import app
 from twin.recording.mcap_log import LogWriter, write_items
 from twin.recording.reader import Recording, read_recording

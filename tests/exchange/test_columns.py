@@ -10,7 +10,8 @@ from table_io.errors import InputError
 from table_io.formats.table import ForeignTable, make_column
 from table_io.formats.timing import find_holes
 from tests.input_errors import raises_input_error
-from twin.exchange.columns import ImportedSamples, read_column_map, read_samples
+from twin.exchange.columns import ImportedSamples, read_samples
+from twin.exchange.import_table import ImportOptions
 
 TIME = np.arange(400) / 200.0
 
@@ -24,7 +25,8 @@ def import_columns(folder: Path, card: str | None = None, **columns: Float1D) ->
     file.touch()
     held = {name: make_column(values) for name, values in columns.items()}
     table = ForeignTable(file, "a table", held, first_row=2)
-    return read_samples(table, read_column_map(path if card is not None else None))
+    options = ImportOptions(columns=path if card is not None else None)
+    return read_samples(table, options.read_map())
 
 
 def require_refused(

@@ -13,7 +13,14 @@ from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.config.folders import find_config
 from tests.input_errors import raises_input_error
-from twin.exchange.drive_file import WRITERS, DriveFile, export_drive, read_drive, write_drive
+from twin.exchange.drive_file import (
+    WRITERS,
+    DriveFile,
+    DriveOptions,
+    export_drive,
+    read_drive,
+    write_drive,
+)
 from twin.rig.table import ExternalController, serve_table
 from twin.setup.run_config import read_run_config
 
@@ -50,7 +57,7 @@ def plan(profile: Path) -> Float1D:
 
 
 def export_file(profile: Path, folder: Path, name: str) -> Path:
-    export_drive(profile, None, folder / name, "")
+    export_drive(DriveOptions(profile, folder / name))
     return folder / name
 
 
@@ -140,11 +147,11 @@ def test_the_simulated_controller_reads_it(
 def test_bad_input_is_told(profile: Path, tmp_path: Path) -> None:
     path = export_file(profile, tmp_path, "drive.csv")
     with raises_input_error(where=f"-o {path}"):
-        export_drive(profile, None, path, "")
+        export_drive(DriveOptions(profile, path))
     with raises_input_error(where="--format '.doc'", allowed="csv, txt"):
-        export_drive(profile, None, tmp_path / "drive.doc", "")
+        export_drive(DriveOptions(profile, tmp_path / "drive.doc"))
     with raises_input_error(key="[track]"):
-        export_drive(find_config("track", "tests"), None, tmp_path / "track.csv", "")
+        export_drive(DriveOptions(find_config("track", "tests"), tmp_path / "track.csv"))
     (tmp_path / "empty.csv").write_text("nothing\n")
     with raises_input_error(where=f"--play {tmp_path / 'empty.csv'}", remedy="shaketwin drive"):
         read_drive(tmp_path / "empty.csv")

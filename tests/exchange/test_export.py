@@ -18,7 +18,7 @@ from tests.exchange.exported import LABEL_FIELDS, LOST, export_formats, measured
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
 from twin.cli.main import app
-from twin.exchange.columns import read_column_map, read_samples
+from twin.exchange.columns import read_samples
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.labels import read_labels
 from twin.recording.mcap_log import write_items
@@ -250,7 +250,7 @@ def test_labels_that_contradict_themselves_name_the_row(out: Path, tmp_path: Pat
         path.write_text("\n".join([*lines[: row - 1], ",".join(cells), *lines[row:]]))
         table = read_table(path)
         with pytest.raises(InputError) as caught:
-            read_labels(table, read_samples(table, read_column_map(None)))
+            read_labels(table, read_samples(table, None))
         for word in (f"row {row}", *words):
             assert word in str(caught.value)
 

@@ -14,7 +14,7 @@ from tests.input_errors import raises_input_error
 from tests.setup.test_unpaced import QUICK, play_run
 from twin.cli.report import print_recording_prc
 from twin.exchange.export import ExportOptions, export_log
-from twin.exchange.import_table import import_samples, print_contents
+from twin.exchange.import_table import ImportOptions, import_table
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.results.recordings import read_recorded_config
@@ -43,7 +43,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Recording]:
 def imported_log(run: tuple[Path, Recording]) -> Recording:
     folder, _ = run
     log = folder / "imported" / "run.mcap"
-    assert import_samples(folder / "table.csv", log, folder / "quick.toml", None, None) == 0
+    assert (
+        import_table(folder / "table.csv", log, ImportOptions(profile=folder / "quick.toml")).gaps
+        == 0
+    )
     return read_recording(log)
 
 
@@ -60,7 +63,7 @@ def read_warnings(recording: Recording) -> str:
     return "\n".join(event.text for event in recording.records(Event))
 
 
-def test_the_samples_are_those_of_the_run(
+def test_import_table_keeps_the_samples(
     run: tuple[Path, Recording], imported_log: Recording
 ) -> None:
     ours, theirs = whole(run[1]), whole(imported_log)
@@ -68,7 +71,7 @@ def test_the_samples_are_those_of_the_run(
     np.testing.assert_allclose(theirs.values, ours.values, rtol=1e-8)
 
 
-def test_steps_and_measured_cycles_are_found_where_they_were_driven(
+def test_import_table_finds_steps_and_measured_cycles(
     run: tuple[Path, Recording], imported_log: Recording
 ) -> None:
     ours, theirs = whole(run[1]), whole(imported_log)
@@ -85,7 +88,9 @@ def test_steps_and_measured_cycles_are_found_where_they_were_driven(
         assert (ours.cycle == theirs.cycle)[held].mean() > 0.98
 
 
-def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported_log: Recording) -> None:
+def test_prc_of_an_import_is_that_of_the_run(
+    run: tuple[Path, Recording], imported_log: Recording
+) -> None:
     for ours, theirs in zip(steps(run[1]), steps(imported_log), strict=True):
         assert ours["frequency_hz"] == theirs["frequency_hz"]
         assert ours["direction"] == theirs["direction"]
@@ -96,7 +101,7 @@ def test_the_prc_is_that_of_the_run(run: tuple[Path, Recording], imported_log: R
         assert ours["measured"]["impacts_right"] == theirs["measured"]["impacts_right"]
 
 
-def test_prc_and_replay_take_it_as_one_of_ours(
+def test_prc_and_replay_read_an_imported_log(
     imported_log: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
 ) -> None:
     print_recording_prc(imported_log.path, True)
@@ -108,13 +113,13 @@ def test_prc_and_replay_take_it_as_one_of_ours(
     assert (tmp_path / "again" / "report.html").stat().st_size > 10_000
 
 
-def test_a_sweep_that_is_another_changes_no_step(
+def test_import_table_with_the_sweep_of_another_profile(
     run: tuple[Path, Recording], tmp_path: Path, draft: None
 ) -> None:
     profile = tmp_path / "other.toml"
     profile.write_text(SHORT.replace("start_hz = 3.6", "start_hz = 1.0").replace("0.2", "1.7"))
     log = tmp_path / "other.mcap"
-    import_samples(run[0] / "table.csv", log, profile, None, None)
+    import_table(run[0] / "table.csv", log, ImportOptions(profile=profile))
     recording = read_recording(log)
     driven = [(step.direction, step.frequency_hz) for step in run[1].start.steps]
     detected = [(step.direction, step.frequency_hz) for step in recording.start.steps]
@@ -130,12 +135,15 @@ def rows(run: tuple[Path, Recording]) -> list[str]:
     return (run[0] / "table.csv").read_text().splitlines()[:6001]
 
 
-def test_a_hole_is_a_gap_between_two_blocks(run: tuple[Path, Recording], tmp_path: Path) -> None:
+def test_import_table_records_a_hole_as_a_gap(run: tuple[Path, Recording], tmp_path: Path) -> None:
     lines = rows(run)
     del lines[2001:2051]
     (tmp_path / "holed.csv").write_text("\n".join(lines))
     log = tmp_path / "run.mcap"
-    assert import_samples(tmp_path / "holed.csv", log, run[0] / "quick.toml", None, None) == 4
+    assert (
+        import_table(tmp_path / "holed.csv", log, ImportOptions(profile=run[0] / "quick.toml")).gaps
+        == 1
+    )
     recording = read_recording(log)
     assert recording.records(SampleGap) == (SampleGap(2000, 50, "", "lost"),)
     assert [(block.index, block.end) for block in recording.contiguous_blocks("meas")] == [
@@ -145,7 +153,9 @@ def test_a_hole_is_a_gap_between_two_blocks(run: tuple[Path, Recording], tmp_pat
     assert recording.missing_samples == 50
 
 
-def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_path: Path) -> None:
+def test_import_table_keeps_lost_cells_and_sensors_lost(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
     table = [line.split(",") for line in rows(run)]
     place = table[0].index("force_r1_n")
     other = table[0].index("mass_acc_m_s2")
@@ -153,9 +163,9 @@ def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_
         line[place] = ""
     table[101][other] = "NaN"
     (tmp_path / "lost.csv").write_text("\n".join(map(",".join, table)))
-    assert import_samples(
-        tmp_path / "lost.csv", tmp_path / "l.mcap", run[0] / "quick.toml", None, None
-    )
+    assert import_table(
+        tmp_path / "lost.csv", tmp_path / "l.mcap", ImportOptions(profile=run[0] / "quick.toml")
+    ).gaps
     recording = read_recording(tmp_path / "l.mcap")
     assert np.isnan(whole(recording).channel("force_r1_n")).all()
     assert np.flatnonzero(np.isnan(whole(recording).channel("mass_acc_m_s2"))).tolist() == [100]
@@ -166,26 +176,28 @@ def test_lost_cells_and_lost_sensors_stay_lost(run: tuple[Path, Recording], tmp_
     assert "force_r1_n: all samples lost" in read_warnings(recording)
 
 
-def test_the_profile_holds_at_another_rate(run: tuple[Path, Recording], tmp_path: Path) -> None:
+def test_import_table_takes_the_rate_of_the_file(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
     lines = rows(run)
     (tmp_path / "half.csv").write_text("\n".join([lines[0], *lines[1::2]]))
     profile = tmp_path / "half.toml"
     profile.write_text(SHORT + "[acquisition]\nblock_samples = 10 # ten\nrate_hz = 2000.0\n")
-    import_samples(tmp_path / "half.csv", tmp_path / "half.mcap", profile, None, None)
+    import_table(tmp_path / "half.csv", tmp_path / "half.mcap", ImportOptions(profile=profile))
     recorded = read_recorded_config(read_recording(tmp_path / "half.mcap")).profile
     assert recorded.acquisition.rate_hz == 1000.0
     assert recorded.acquisition.block_samples == 10
     assert recorded.specimen.gap_mm == 4.0
     (tmp_path / "slow.csv").write_text("\n".join([lines[0], *lines[1::10]]))
     with pytest.raises(InputError, match=r"200 Hz of .*slow.csv(.|\n)*at least 440"):
-        import_samples(tmp_path / "slow.csv", tmp_path / "slow.mcap", profile, None, None)
+        import_table(tmp_path / "slow.csv", tmp_path / "slow.mcap", ImportOptions(profile=profile))
 
 
-def test_our_own_export_is_the_same_run_again(
+def test_import_table_of_an_export_is_identical(
     run: tuple[Path, Recording], tmp_path: Path, draft: None
 ) -> None:
     export_log(ExportOptions(run[1].path, ("parquet",), tmp_path / "out"))
-    assert import_samples(tmp_path / "out.parquet", tmp_path / "again.mcap", None, None, None) == 0
+    assert import_table(tmp_path / "out.parquet", tmp_path / "again.mcap").gaps == 0
     again = read_recording(tmp_path / "again.mcap")
     assert whole(again).is_identical(whole(run[1]))
     for name in ("steps", "profile_toml", "rig_toml", "model_toml"):
@@ -197,23 +209,27 @@ def test_our_own_export_is_the_same_run_again(
     assert "steps, labels and cycles are taken from the file" in read_warnings(again)
 
 
-def test_a_table_without_a_profile_says_so_and_has_its_curve(
-    run: tuple[Path, Recording], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_import_table_without_a_profile_warns_and_has_its_curve(
+    run: tuple[Path, Recording], tmp_path: Path
 ) -> None:
     """Its labels tell how many cycles were held and measured, 6 and 2 here."""
     export_log(ExportOptions(run[1].path, ("csv",), tmp_path / "out"))
-    assert import_samples(tmp_path / "out.csv", tmp_path / "bare.mcap", None, None, None) == 0
+    imported = import_table(tmp_path / "out.csv", tmp_path / "bare.mcap")
     bare = read_recording(tmp_path / "bare.mcap")
     assert len(bare.records(PrcPoint)) == len(run[1].start.steps)
     sweep = read_recorded_config(bare).profile.sweep
     assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
     (warning,) = (event for event in bare.records(Event) if event.kind == "warning")
     assert warning.text.startswith("no --profile: unit mass, no bumpers, a placeholder model")
-    assert warning.text in capsys.readouterr().out
+    assert f"warning: {warning.text}" in imported.notes
+    bare_size = len(whole(bare))
+    assert (imported.gaps, imported.samples, imported.channels) == (
+        0, bare_size, bare.start.channels,
+    )  # fmt: skip
     assert "no --profile" not in read_warnings(run[1])
 
 
-def test_labels_of_a_table_stand_before_what_its_motion_tells(
+def test_import_table_prefers_labels_to_detected_steps(
     run: tuple[Path, Recording], tmp_path: Path
 ) -> None:
     """One that is not all of them is none."""
@@ -222,7 +238,9 @@ def test_labels_of_a_table_stand_before_what_its_motion_tells(
             run[1].path, ("csv",), tmp_path / "out", channels=("table_acc_m_s2",), steps=(1, 2)
         )
     )
-    import_samples(tmp_path / "out.csv", tmp_path / "a.mcap", run[0] / "quick.toml", None, None)
+    import_table(
+        tmp_path / "out.csv", tmp_path / "a.mcap", ImportOptions(profile=run[0] / "quick.toml")
+    )
     steps = read_recording(tmp_path / "a.mcap").start.steps
     assert [step.frequency_hz for step in steps] == [
         step.frequency_hz for step in run[1].start.steps[1:3]
@@ -231,36 +249,33 @@ def test_labels_of_a_table_stand_before_what_its_motion_tells(
     kept = [k for k, name in enumerate(lines[0].split(",")) if name != "cycle"]
     rows = [",".join(line.split(",")[k] for k in kept) for line in lines]
     (tmp_path / "less.csv").write_text("\n".join(rows))
-    import_samples(tmp_path / "less.csv", tmp_path / "b.mcap", run[0] / "quick.toml", None, None)
+    import_table(
+        tmp_path / "less.csv", tmp_path / "b.mcap", ImportOptions(profile=run[0] / "quick.toml")
+    )
     assert "left out: step, label, direction" in read_warnings(read_recording(tmp_path / "b.mcap"))
 
 
-def test_a_shaking_table_of_others(tmp_path: Path) -> None:
+def test_import_table_of_a_shaking_table_by_a_map(tmp_path: Path) -> None:
     card = tmp_path / "map.toml"
     card.write_text(
         '[columns]\ntime_s = { column = "timepos:1" }\n'
         'table_disp_m = { column = "timepos:2", gain = 0.01 }\n'
     )
     file = open_dataset("shaking_table/SineA5F2.npz")
-    assert import_samples(file, tmp_path / "a.mcap", None, None, card) == 0
+    assert import_table(file, tmp_path / "a.mcap", ImportOptions(columns=card)).gaps == 0
     recording = read_recording(tmp_path / "a.mcap")
     assert (whole(recording).rate_hz, len(whole(recording))) == (200.0, 4001)
     (step,) = recording.start.steps
     assert step.frequency_hz == pytest.approx(2.0, rel=1e-3)
 
 
-def test_what_a_file_holds(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    print_contents(open_dataset("bncs/CNP100.csv"), None)
-    assert "rel_disp_m: " in capsys.readouterr().out
-
-
-def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path: Path) -> None:
+def test_import_table_of_a_component_test_is_not_replayed(tmp_path: Path) -> None:
     time = np.arange(4000) / 200
     u = 0.01 * np.sin(2 * np.pi * time)
     table = np.array([time, u, 36e3 * u]).T
     file, log = tmp_path / "component.csv", tmp_path / "component.mcap"
     np.savetxt(file, table, delimiter=",", header="time_s,rel_disp_m,damper_force_n", comments="")
-    assert import_samples(file, log, None, None, None) == 0
+    assert import_table(file, log).gaps == 0
     recording = read_recording(log)
     assert recording.start.channels == ("damper_force_n", "rel_disp_m")
     assert not recording.records(Comparison)
@@ -269,7 +284,7 @@ def test_a_component_test_without_a_table_is_a_log_that_is_not_replayed(tmp_path
     with raises_input_error(where=log, key="table_acc_m_s2"):
         replay_logs(ReplayRequest([log], [], tmp_path / "out"))
     with raises_input_error(where=log):
-        import_samples(file, log, None, None, None)
+        import_table(file, log)
 
 
 def open_dataset(name: str) -> Path:
@@ -279,9 +294,9 @@ def open_dataset(name: str) -> Path:
     return path
 
 
-def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
+def test_import_table_of_an_earthquake_has_no_steps(tmp_path: Path, draft: None) -> None:
     log = tmp_path / "b" / "run.mcap"
-    assert import_samples(open_dataset("bncs/CNP100.csv"), log, None, None, None) == 0
+    assert import_table(open_dataset("bncs/CNP100.csv"), log).gaps == 0
     recording = read_recording(log)
     block = whole(recording)
     assert block.rate_hz == 200.0
@@ -292,12 +307,12 @@ def test_a_building_under_an_earthquake(tmp_path: Path, draft: None) -> None:
     assert replay_logs(ReplayRequest([log], [], tmp_path / "again")) == 0
 
 
-def test_the_silverbox_by_a_map(tmp_path: Path) -> None:
+def test_import_table_of_the_silverbox_by_a_map(tmp_path: Path) -> None:
     (tmp_path / "map.toml").write_text(SILVERBOX)
     file, log = tmp_path / "s.csv", tmp_path / "s.mcap"
     lines = open_dataset("silverbox/SNLS80mV.csv").read_text().splitlines(keepends=True)
     file.write_text("".join(lines[:20_001]))
-    assert import_samples(file, log, None, None, tmp_path / "map.toml") == 0
+    assert import_table(file, log, ImportOptions(columns=tmp_path / "map.toml")).gaps == 0
     block = whole(read_recording(log))
     assert (block.rate_hz, len(block)) == (610.35, 20_000)
     assert block.channel("table_acc_m_s2")[0] == -0.0057756

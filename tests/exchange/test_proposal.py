@@ -1,5 +1,6 @@
 """The map that is proposed for a foreign table: channels, units, rate, mass, and open questions."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,7 @@ from table_io.errors import InputError
 from table_io.formats.table import ForeignTable, make_column
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
-from twin.exchange.columns import read_column_map
-from twin.exchange.import_table import ImportOptions, import_samples
+from twin.exchange.import_table import ImportOptions, import_table
 from twin.exchange.proposal import MapProposal, propose_map
 from twin.recording.reader import read_recording
 from twin.results.recordings import read_recorded_config
@@ -61,7 +61,7 @@ def sources(proposal: MapProposal) -> dict[str, tuple[str, str]]:
         ),
     ],
 )  # fmt: skip
-def test_names_and_units_of_laboratories(
+def test_propose_map_by_names_and_units(
     columns: dict[str, Float1D], expected: dict[str, str]
 ) -> None:
     proposal = propose(columns)
@@ -71,7 +71,7 @@ def test_names_and_units_of_laboratories(
         assert [*columns].index(column) == [*expected].index(channel)
 
 
-def test_units_of_the_file_are_taken() -> None:
+def test_propose_map_by_units_of_the_file() -> None:
     proposal = propose({"t": TIME, "x": U, "F": U}, {"t": "sec", "x": "millimetre", "F": "kips"})
     assert sources(proposal)["rel_disp_m"] == ("x", "mm")
     assert sources(proposal)["damper_force_n"] == ("F", "kip")
@@ -88,33 +88,38 @@ def test_units_of_the_file_are_taken() -> None:
         ({"t": TIME, "acc base (g)": ACC, "acc table (g)": ACC}, "acc table (g)"),
     ],
 )
-def test_what_names_and_units_leave_open_is_asked(columns: dict[str, Float1D], column: str) -> None:
+def test_propose_map_asks_what_is_open(columns: dict[str, Float1D], column: str) -> None:
     proposal = propose(columns)
     assert any(repr(column) in question for question in proposal.questions)
 
 
-def test_a_range_that_fits_one_unit_only_is_proposed_with_its_reason() -> None:
+def test_propose_map_by_a_range_that_fits_one_unit() -> None:
     proposal = propose({"t": TIME, "stroke": 300.0 * U, "load (N)": U})
     item = {item.channel: item for item in proposal.columns}["rel_disp_m"]
     assert item.unit == "mm"
     assert "600" in item.reason
 
 
-def test_a_unit_follows_from_the_other_sensor_of_the_motion() -> None:
+def test_propose_map_by_the_other_sensor_of_the_motion() -> None:
     columns = {"t": TIME, "table disp": 4.0 * U, "acc table (g)": 4e-3 * ACC / 9.80665}
     assert sources(propose(columns))["table_disp_m"] == ("table disp", "mm")
 
 
-def test_rate_and_mass_are_those_of_the_file_or_asked() -> None:
+def test_propose_map_takes_rate_and_mass_of_the_file_or_asks() -> None:
     stated = propose({"stroke (mm)": U, "load (N)": U}, rate_hz=200.0, mass_kg=3.0)
     assert (stated.rate_hz, stated.mass_kg, stated.questions) == (200.0, 3.0, ())
     unstated = propose({"stroke (mm)": U, "load (N)": U})
     assert any("--rate" in question for question in unstated.questions)
+    held = {name: make_column(U, "m/s2") for name in ("Acc 1", "Acc 2")}
+    columns = {name: replace(column, rate_hz=200.0) for name, column in held.items()}
+    open_bodies = propose_map(ForeignTable(Path("two.uff"), "a UFF file", columns))
+    assert open_bodies.file_rate_hz == 200.0
+    assert not any("--rate" in question for question in open_bodies.questions)
     milli = propose({"time": 1e3 * TIME, "stroke (mm)": U, "load (N)": U}, rate_hz=200.0)
     assert sources(milli)["time_s"] == ("time", "ms")
 
 
-def test_what_is_missing_is_listed() -> None:
+def test_propose_map_lists_what_is_missing() -> None:
     component = propose({"t": TIME, "stroke (mm)": U, "load (N)": U})
     assert component.missing == ()
     accelerations = propose({"t": TIME, "acc base (g)": ACC, "acc top (g)": ACC})
@@ -122,7 +127,19 @@ def test_what_is_missing_is_listed() -> None:
     assert any("--mass" in text for text in accelerations.missing)
 
 
-def test_a_saved_map_is_read_again_and_its_open_units_are_refused(tmp_path: Path) -> None:
+def test_propose_map_names_what_is_left_out_and_why() -> None:
+    held = {name: make_column(values) for name, values in (("t", TIME), ("stroke (mm)", U))}
+    held["load (N)"] = make_column(U[:-10])
+    table = ForeignTable(Path("a.csv"), "a table", held, {"state": "text, such as 'OK'"})
+    expected = ("load (N) (1990 rows, the others 2000)", "state (text, such as 'OK')")
+    assert propose_map(table).dropped == expected
+    rated = {name: replace(column, rate_hz=200.0) for name, column in held.items() if name != "t"}
+    assert [item.channel for item in propose_map(replace(table, columns=rated)).columns] == [
+        "damper_force_n", "rel_disp_m",
+    ]  # fmt: skip
+
+
+def test_import_table_refuses_open_units_of_a_saved_map(tmp_path: Path) -> None:
     table = tmp_path / "damper.csv"
     np.savetxt(
         table, np.array([TIME, 30 * U, U]).T, delimiter=",", header="time,stroke,load", comments=""
@@ -130,11 +147,15 @@ def test_a_saved_map_is_read_again_and_its_open_units_are_refused(tmp_path: Path
     card = tmp_path / "map.toml"
     with pytest.raises(SystemExit):
         app(["import", str(table), "--save-map", str(card)])
-    assert set(read_column_map(card).columns) == {"time_s", "rel_disp_m", "damper_force_n"}  # type: ignore[union-attr]
+    assert set(ImportOptions(columns=card).read_map().columns) == {
+        "time_s",
+        "rel_disp_m",
+        "damper_force_n",
+    }  # type: ignore[union-attr]
     with raises_input_error(key="columns", allowed="kip"):
-        import_samples(table, tmp_path / "a.mcap", None, None, card)
+        import_table(table, tmp_path / "a.mcap", ImportOptions(columns=card))
     with raises_input_error(where=table, problem="stroke", remedy="--save-map"):
-        import_samples(table, tmp_path / "a.mcap", None, None, None, ImportOptions(accept=True))
+        import_table(table, tmp_path / "a.mcap", ImportOptions(accept=True))
     assert not (tmp_path / "a.mcap").exists()
 
 
@@ -147,16 +168,16 @@ def write_component(path: Path, rate_hz: float = 200.0, offset: float = 0.0) -> 
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 13.1, 26.2, 5000.0])
-def test_any_rate_is_imported_without_a_profile(tmp_path: Path, rate_hz: float) -> None:
+def test_import_table_at_any_rate_without_a_profile(tmp_path: Path, rate_hz: float) -> None:
     file, log = write_component(tmp_path / "slow.txt", rate_hz), tmp_path / "slow.mcap"
-    assert import_samples(file, log, None, None, None, ImportOptions(accept=True)) == 0
+    assert import_table(file, log, ImportOptions(accept=True)).gaps == 0
     assert read_recording(log).start.rate_hz == pytest.approx(rate_hz, rel=1e-4)
 
 
-def test_options_of_an_import_are_those_of_a_map(tmp_path: Path) -> None:
+def test_import_table_applies_settings(tmp_path: Path) -> None:
     file, log = write_component(tmp_path / "a.txt", offset=5.0), tmp_path / "a.mcap"
     settings = {"mass_kg": 250.0, "from_s": 1.0, "to_s": 19.0, "rest": False, "detrend": "mean"}
-    import_samples(file, log, None, None, None, ImportOptions(True, settings))
+    import_table(file, log, ImportOptions(accept=True, settings=settings))
     recording = read_recording(log)
     (block,) = recording.contiguous_blocks("meas")
     assert len(block) == 3601
@@ -165,9 +186,7 @@ def test_options_of_an_import_are_those_of_a_map(tmp_path: Path) -> None:
     assert read_recorded_config(recording).profile.specimen.mass_kg == 250.0
 
 
-def test_a_still_beginning_off_zero_is_warned_of(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_import_table_warns_of_rest_off_zero(tmp_path: Path) -> None:
     """A component that is held off its zero is not at rest, unless the user says so."""
     for offset, settings, is_rest, warned in (
         (0.0, {}, True, False), (5.0, {}, False, True), (5.0, {"rest": True}, True, False),
@@ -177,13 +196,13 @@ def test_a_still_beginning_off_zero_is_warned_of(
             write_component(tmp_path / f"{name}.txt", offset=offset),
             tmp_path / f"{name}.mcap",
         )
-        import_samples(file, log, None, None, None, ImportOptions(True, settings))
+        notes = import_table(file, log, ImportOptions(accept=True, settings=settings)).notes
         (block,) = read_recording(log).contiguous_blocks("meas")
         assert bool(block.label[0] == Label.REST) is is_rest
-        assert ("warning: rel_disp_m" in capsys.readouterr().out) is warned
+        assert any(note.startswith("warning: rel_disp_m") for note in notes) is warned
 
 
-def test_several_runs_become_the_logs_of_a_folder(tmp_path: Path) -> None:
+def test_import_command_of_several_files(tmp_path: Path) -> None:
     files = [str(write_component(tmp_path / f"run{k}.txt")) for k in (1, 2)]
     with pytest.raises(SystemExit) as ended:
         app(["import", *files, "-o", str(tmp_path / "logs"), "--accept"])
@@ -195,7 +214,7 @@ def test_several_runs_become_the_logs_of_a_folder(tmp_path: Path) -> None:
         app(["import", *files, "-o", str(tmp_path / "one.mcap"), "--accept"], standalone_mode=False)
 
 
-def test_a_workbook_is_read_as_it_was_exported(tmp_path: Path) -> None:
+def test_import_table_of_a_workbook(tmp_path: Path) -> None:
     openpyxl = pytest.importorskip("openpyxl")
     workbook = openpyxl.Workbook()
     sheet = workbook.active
@@ -209,7 +228,7 @@ def test_a_workbook_is_read_as_it_was_exported(tmp_path: Path) -> None:
     workbook.create_sheet("remarks").append(["nothing", "to", "see"])
     file, log = tmp_path / "book.xlsx", tmp_path / "book.mcap"
     workbook.save(file)
-    import_samples(file, log, None, None, None, ImportOptions(accept=True))
+    import_table(file, log, ImportOptions(accept=True))
     recording = read_recording(log)
     (block,) = recording.contiguous_blocks("meas")
     np.testing.assert_allclose(block.channel("rel_disp_m"), 1e-3 * U[:400])
@@ -218,17 +237,17 @@ def test_a_workbook_is_read_as_it_was_exported(tmp_path: Path) -> None:
     sheet.cell(20, 2).value = "broken"
     workbook.save(file)
     with pytest.raises(InputError) as caught:
-        import_samples(file, tmp_path / "b.mcap", None, None, None, ImportOptions(accept=True))
+        import_table(file, tmp_path / "b.mcap", ImportOptions(accept=True))
     assert "row 20" in str(caught.value)
     file.write_bytes(file.read_bytes()[:2000])
     with raises_input_error(where=file):
-        import_samples(file, tmp_path / "c.mcap", None, None, None, ImportOptions(accept=True))
+        import_table(file, tmp_path / "c.mcap", ImportOptions(accept=True))
 
 
-def test_a_motion_without_steps_gets_none_of_the_placeholder(tmp_path: Path) -> None:
+def test_import_table_without_steps_plans_none(tmp_path: Path) -> None:
     noise = np.cumsum(np.random.default_rng(0).normal(size=TIME.size)) * 1e-2
     file, log = tmp_path / "noise.csv", tmp_path / "noise.mcap"
     table = np.array([TIME, noise, 36 * noise])
     np.savetxt(file, table.T, delimiter=",", header="t (s),stroke (mm),load (N)", comments="")
-    import_samples(file, log, None, None, None, ImportOptions(accept=True))
+    import_table(file, log, ImportOptions(accept=True))
     assert read_recording(log).start.steps == ()

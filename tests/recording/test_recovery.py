@@ -16,9 +16,9 @@ from mcap.writer import CompressionType, Writer
 
 from table_io.block import Block
 from table_io.records import Comparison, Fault, FrequencyResponse, RunStop, Step, StepAdded
-from tests.exchange.mutants import BOMBS, bomb, spans, write_messages
 from tests.input_errors import raises_input_error
 from tests.recording.example_run import RATE_HZ, START, payloads, run, write
+from tests.recording.mutants import BOMBS, bomb, spans, write_messages
 from twin.recording.mcap_log import LogWriter
 from twin.recording.merge import merge
 from twin.recording.reader import read_recording

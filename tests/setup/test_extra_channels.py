@@ -17,7 +17,7 @@ from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD
 from tests.viewer.example_run import scalars
 from twin.cli.main import app
 from twin.compare import COMPARED_CHANNELS
-from twin.exchange.import_table import import_samples
+from twin.exchange.import_table import ImportOptions, import_table
 from twin.log import open_log
 from twin.monitor.panels import draw_limits, draw_twin, format_gaps
 from twin.monitor.run_state import LiveRunState, update_run_state
@@ -135,7 +135,7 @@ def test_an_export_has_their_columns_and_comes_back(run: Path, lab: Path, kind: 
     test = ("--profile", lab / "tests/short.toml")
     if kind == "csv":
         with pytest.raises(InputError) as caught:
-            import_samples(lab / "out.csv", back, test[1], "simulated", None)
+            import_table(lab / "out.csv", back, ImportOptions(profile=test[1], rig="simulated"))
         assert SECOND_ACC in caught.value.problem
         shaketwin("import", lab / "out.csv", "-o", back, *test)
     else:  # carries units and the rig file

@@ -21,7 +21,7 @@ from tests.replay.in_memory import recorded_in
 from tests.table_io.excitation.pulse_train import PulseTrain
 from twin.cli.simulate import simulate_profile
 from twin.exchange.export import ExportOptions, export_log
-from twin.exchange.import_table import import_samples
+from twin.exchange.import_table import import_table
 from twin.live.run_command import run_test
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import replay_recording
@@ -295,7 +295,7 @@ def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Pa
     _, recording, summary = run
     table = tmp_path / f"samples.{kind}"
     export_log(ExportOptions(recording.path, (kind,), tmp_path / "samples"))
-    assert import_samples(table, tmp_path / "back.mcap", None, None, None) == 0
+    assert import_table(table, tmp_path / "back.mcap").gaps == 0
     back = read_recording(tmp_path / "back.mcap")
     assert back.start.steps == ()
     config = from_texts(

@@ -18,7 +18,7 @@ from time import process_time
 
 from table_io.errors import InputError
 from table_io.formats import read_table
-from tests.exchange.test_formats import FORMATS
+from tests.table_io.formats.test_formats import FORMATS
 from twin.exchange.columns import ColumnMap, read_samples
 
 HEAD_BYTES = 4000  # bytes in which half of the changes lie: there stands what a file says of itself

@@ -28,8 +28,8 @@ from tempfile import TemporaryDirectory
 import pytest
 from typer.main import get_command
 
-from tests.exchange import mutants
 from tests.exchange.csv_tables import write_csv
+from tests.recording import mutants
 
 ALLOWED = {0, 2, 3, 4, 5}
 MEMORY = 2 * 2**30  # bytes a process may have
@@ -143,7 +143,7 @@ class Trials:
 def _formats() -> list[tuple[str, Callable[[Path], bytes]]]:
     """(name, what writes such a file and reads it back) of each format of other tools."""
     try:
-        from tests.exchange.test_formats import FORMATS
+        from tests.table_io.formats.test_formats import FORMATS
     except (ModuleNotFoundError, pytest.skip.Exception):
         return []  # without their libraries
 

@@ -126,33 +126,24 @@ def import_command(
 ) -> None:
     """Import tables of samples as logs; without -o, propose which column is which channel."""
     from table_io.config.folders import resolve_config
-    from table_io.errors import InputError
-    from twin.exchange import import_command as import_files
+    from twin.exchange.command import list_contents, parse_band, run_import
+    from twin.exchange.import_table import ImportOptions
 
-    if profile is not None:
-        profile = resolve_config(profile, "tests")
-    if contents:
-        if out is not None:
-            raise InputError(
-                f"--list writes no log, it only prints the contents of {files[0]}",
-                where=f"-o {out}",
-                remedy="omit -o or --list",
-            )
-        from twin.exchange.import_table import print_contents
-
-        for file in files:
-            print_contents(file, columns)
-        return
     stated = {
         "mass_kg": mass, "rate_hz": rate, "from_s": from_s, "to_s": to_s, "detrend": detrend,
-        "rest": rest,
-        "integrate_hz": import_files.parse_band(integrate),
+        "rest": rest, "integrate_hz": parse_band(integrate),
     }  # fmt: skip
-    request = import_files.ImportRequest(
-        files, out, profile, rig, columns, accept, save_map,
-        {key: value for key, value in stated.items() if value is not None},
-    )  # fmt: skip
-    raise typer.Exit(import_files.run_import(request))
+    options = ImportOptions(
+        profile=None if profile is None else resolve_config(profile, "tests"),
+        rig=rig,
+        columns=columns,
+        accept=accept,
+        settings={key: value for key, value in stated.items() if value is not None},
+    )
+    if contents:
+        list_contents(files, out, options)
+        return
+    raise typer.Exit(run_import(files, out, save_map, options))
 
 
 @files_app.command("export", rich_help_panel=FILES_PANEL)
@@ -184,8 +175,8 @@ def export_command(
     steps: StepsOption = None,
 ) -> None:
     """Export measurement and twin of a log for other tools, in several formats at once."""
-    from twin.exchange.export import ExportOptions, export_log
-    from twin.system.terminal import error_console, print_line
+    from twin.exchange.command import run_export
+    from twin.exchange.export import ExportOptions
 
     requested = {"csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd}
     formats = [kind for kind, wanted in requested.items() if wanted]
@@ -194,16 +185,4 @@ def export_command(
         from twin.recording.tabular import parse_step_range
 
         step_span = parse_step_range(steps)
-    exported = export_log(ExportOptions(log, tuple(formats), out, tuple(channel or ()), step_span))
-    if not exported.is_intact:
-        error_console.print(
-            f"warning: {log} is unfinished or has invalid items; "
-            f"`shaketwin verify {log}` lists what is missing",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-    for path in exported.files:
-        has_rows = path.suffix not in (".rrd", ".json")
-        size = f"{exported.rows} rows of {exported.columns} columns -> " if has_rows else ""
-        print_line(f"{size}{path}")
+    run_export(ExportOptions(log, tuple(formats), out, tuple(channel or ()), step_span))

@@ -322,9 +322,10 @@ def drive_command(
     ] = "",
 ) -> None:
     """Export the planned drive for an external controller, which `run --table` then follows."""
-    from twin.exchange.drive_file import export_drive as command
+    from twin.exchange.command import run_drive
+    from twin.exchange.drive_file import DriveOptions
 
-    command(profile, table, out, format)
+    run_drive(DriveOptions(profile, out, table, format))
 
 
 @app.command("simulate", rich_help_panel=DRIVE_PANEL)

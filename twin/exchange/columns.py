@@ -6,7 +6,6 @@ refused; in a stated unit they cause a warning.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -20,7 +19,7 @@ from table_io.channels import (
     TIME_COLUMN,
     Channel,
 )
-from table_io.config.base import ConfigModel, Finite, Positive, load_config
+from table_io.config.base import ConfigModel, Finite, Positive
 from table_io.errors import InputError, suggest
 from table_io.formats import MAX_LISTED_COLUMNS
 from table_io.formats.table import ForeignTable
@@ -432,8 +431,3 @@ def _remove_trend(values: Float1D, index: Int1D, degree: int) -> Float1D:
     line = np.polynomial.Polynomial.fit(index[is_finite], values[is_finite], degree)
     detrended: Float1D = values - line(index)
     return detrended
-
-
-def read_column_map(path: Path | None) -> ColumnMap | None:
-    """Read a --columns file; raise InputError that lists all its faults."""
-    return None if path is None else load_config(path, ColumnMap, "column map")[0]

@@ -1,4 +1,4 @@
-"""`shaketwin drive`: export of the planned drive as a file for another controller, and its reader.
+"""Task `drive`: export of the planned drive as a file for another controller, and its reader.
 
     csv  header line, after comments with unit, rate and hash
     txt  time in s and displacement in mm, separated by a tab, without header
@@ -23,8 +23,9 @@ import numpy as np
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.errors import InputError
+from table_io.formats import read_table
+from table_io.formats.timing import measure_rate
 from twin.setup.run_config import read_run_config
-from twin.system.terminal import print_line
 
 CSV_HEADER = "time_s,drive_disp_mm"
 RPC_FRAME_POINTS = 1024
@@ -51,30 +52,49 @@ class DriveFile:
         return np.arange(self.values_m.size) / self.rate_hz
 
 
-def export_drive(profile: Path, table: str | None, out: Path, file_format: str) -> None:
+@dataclass(frozen=True)
+class DriveOptions:
+    """Test whose planned drive is exported, on the table that it names or another one.
+
+    `file_format`: a key of WRITERS; by the ending of `out` if it is empty.
+    """
+
+    profile: Path
+    out: Path
+    table: str | None = None
+    file_format: str = ""
+
+
+@dataclass(frozen=True)
+class ExportedDrive:
+    """New drive file: path, format, and the drive in it; its largest value in m."""
+
+    path: Path
+    file_format: str
+    drive: DriveFile
+
+    @property
+    def peak_m(self) -> float:
+        return float(np.abs(self.drive.values_m).max())
+
+
+def export_drive(options: DriveOptions) -> ExportedDrive:
     """Write the planned drive of a test to a new file."""
-    file_format = file_format or FORMAT_BY_SUFFIX.get(out.suffix.lower(), "")
+    out = options.out
+    file_format = options.file_format or FORMAT_BY_SUFFIX.get(out.suffix.lower(), "")
     if file_format not in WRITERS:
         raise InputError(
             "unknown format",
             where=f"--format {file_format or out.suffix or out.name!r}",
             allowed=", ".join(WRITERS),
         )
-    bundle = read_run_config(profile, table)
-    plan, rig = plan_open_loop_drive(bundle.profile, bundle.rig), bundle.rig
+    bundle = read_run_config(options.profile, options.table)
+    plan = plan_open_loop_drive(bundle.profile, bundle.rig)
     rest_samples = math.ceil(bundle.profile.acquisition.rest_s * plan.rate_hz)
     values = plan.command(0, plan.rest_start + rest_samples)
-    file = DriveFile(bundle.name, values, plan.rate_hz, rig.output.span_mm)
-    write_drive(out, file_format, file)
-    print_line(
-        f"{out} ({file_format}): {values.size} values at {plan.rate_hz:g} Hz, "
-        f"{values.size / plan.rate_hz:.1f} s, largest {abs(values).max() * 1e3:.4g} mm, sha256 "
-        f"{file.sha256}"
-    )
-    if file_format == "rpc":
-        step = abs(values).max() * 1e6 / RPC_PEAK
-        print_line(f"resolution of rpc: {step:.3g} um; the other formats are finer")
-    print_line("play it once, from rest, unscaled, without a ramp or filter of the controller")
+    drive = DriveFile(bundle.name, values, plan.rate_hz, bundle.rig.output.span_mm)
+    write_drive(out, file_format, drive)
+    return ExportedDrive(out, file_format, drive)
 
 
 def write_drive(path: Path, file_format: str, file: DriveFile) -> None:
@@ -225,24 +245,16 @@ def read_drive(path: Path) -> tuple[Float1D, float]:
     not a drive.
     """
     try:
-        lines = path.read_text(encoding="ascii").splitlines()
-        rows = [line for line in lines if line and line[0] in "0123456789-+. "]
-        table = np.loadtxt(rows, delimiter="," if "," in rows[0] else None, ndmin=2)
-    except (OSError, ValueError, IndexError) as error:
+        table = read_table(path)
+        times, values = (table.read_column(name) for name in table.columns)
+        if not np.isfinite([times, values]).all():
+            raise ValueError("it has values that are no numbers")
+        rate_hz = round(measure_rate(times, table), 3)
+    except ValueError as error:  # InputError, or another number of columns
         raise InputError(
             f"no drive file ({error})",
             where=f"--play {path}",
+            allowed="two columns, rising time in s and displacement in mm",
             remedy="make one: shaketwin drive PROFILE -o FILE.csv",
         ) from None
-    steps = np.diff(table[:, 0])
-    if table.shape[1] != 2 or table.shape[0] < 2 or not steps.min() > 0:
-        raise InputError(
-            "wrong columns",
-            where=f"--play {path}",
-            allowed="two columns, rising time in s and displacement in mm",
-        )
-    if not np.isfinite(table).all():
-        raise InputError(
-            "has values that are no numbers", where=f"--play {path}", remedy="make the file again"
-        )
-    return table[:, 1] * 1e-3, round(float(1.0 / steps.mean()), 3)
+    return values * 1e-3, rate_hz

@@ -1,9 +1,9 @@
-"""`shaketwin import`: conversion of a table of samples to a log."""
+"""Task `import`: conversion of a table of samples to a log."""
 
 import json
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,17 +26,13 @@ from twin.exchange.columns import (
     ColumnMap,
     ImportColumns,
     ImportedSamples,
-    read_column_map,
     read_samples,
 )
 from twin.exchange.labels import read_labels, typical_cycles
-from twin.exchange.proposal import propose_map
-from twin.report.finalize import EXIT_GAPS
+from twin.exchange.proposal import MapProposal, propose_map
 from twin.setup.run_config import RunConfig, from_texts, make_run_id, read_model
 from twin.setup.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
 from twin.setup.warm_up import compile_kernels
-from twin.system.progress import RunProgress
-from twin.system.terminal import console, print_line
 from twin.transport.codec import Item
 
 NO_PROFILE = (
@@ -106,87 +102,113 @@ class _SampleGrid:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of an import that a column map may also state; those given here win.
+    """What is stated of the files of an import besides themselves.
 
-    `accept`: take the proposed map.
+    `columns` is the file of a column map; `accept`: the proposed map is taken. `settings` are keys
+    of a column map, which win over those in it. `rig`: in place of that of the profile.
     """
 
+    profile: Path | None = None
+    rig: str | None = None
+    columns: Path | None = None
     accept: bool = False
-    settings: Mapping[str, Any] = field(default_factory=dict)  # keys of ColumnMap
+    settings: Mapping[str, Any] = field(default_factory=dict)
 
-    def apply(self, column_map: ColumnMap | None) -> ColumnMap | None:
-        """Return the map with these settings; None if there is nothing to state."""
+    def read_map(self) -> ColumnMap | None:
+        """Read the column map; None without one. InputError lists all its faults."""
+        return (
+            None if self.columns is None else load_config(self.columns, ColumnMap, "column map")[0]
+        )
+
+    def apply_settings(self, column_map: ColumnMap | None) -> ColumnMap | None:
+        """Return the map with the settings; None if there is nothing to state."""
         if not self.settings:
             return column_map
         stated = column_map.model_dump(exclude_unset=True) if column_map is not None else {}
         return ColumnMap.model_validate(stated | dict(self.settings))
 
 
-def import_samples(
+@dataclass(frozen=True)
+class Imported:
+    """New log of an import: its samples and channels, gaps, and what was decided on the way."""
+
+    log: Path
+    samples: int
+    channels: tuple[str, ...]
+    gaps: int
+    notes: tuple[str, ...]
+
+
+def import_table(
     file: Path,
     out: Path,
-    profile: Path | None,
-    rig: str | None,
-    columns: Path | None,
     options: ImportOptions = ImportOptions(),
-) -> int:
-    """Convert the table in `file` to a new log at `out`; return the exit code."""
+    on_item: Callable[[Item], None] = lambda _: None,
+) -> Imported:
+    """Convert the table in `file` to a new log at `out`; `on_item` gets each item of the log."""
     if out.exists():
         raise InputError("exists already", where=out, remedy="nothing recorded is ever overwritten")
     if out.suffix != ".mcap":
         raise InputError("not the name of a log", where=out, allowed="names that end in .mcap")
-    column_map = read_column_map(columns)
-    if profile is not None:
-        load_profile(profile)  # report errors before reading a long table
+    column_map = options.read_map()
+    if options.profile is not None:
+        load_profile(options.profile)  # report errors before reading a long table
     table = read_table(file, column_map.group if column_map is not None else "")
-    rig_toml = read_rig_toml(table, profile, rig)
+    rig_toml = _read_rig_toml(table, options)
     known = ImportColumns(read_channels(rig_toml))
     if options.accept:
-        column_map = _accept_proposal(table, known, options, profile)
-    is_mapped = columns is not None or options.accept
-    column_map = options.apply(column_map)
-    samples_read = read_samples(table, column_map, known, leave_out=is_mapped)
-    file_labels = read_labels(table, samples_read) if samples_read.labels else None
+        column_map = _accept_proposal(table, known, options)
+    column_map = options.apply_settings(column_map)
+    is_mapped = options.columns is not None or options.accept
+    samples = read_samples(table, column_map, known, leave_out=is_mapped)
+    file_labels = read_labels(table, samples) if samples.labels else None
     mass_kg = column_map.mass_kg if column_map is not None else None
-    config = _build_run_config(table, profile, rig_toml, samples_read.rate_hz, file_labels, mass_kg)
-    grid = _to_grid(file, samples_read)
-    labels = file_labels or _detect_labels(grid, config, on_grid=profile is not None)
+    config = _build_run_config(table, options, rig_toml, samples.rate_hz, file_labels, mass_kg)
+    grid = _to_grid(file, samples)
+    labels = file_labels or _detect_labels(grid, config, on_grid=options.profile is not None)
     is_rest = column_map.rest if column_map is not None else None
-    labels = _judge_rest(grid, labels, is_rest, is_component=profile is None)
+    labels = _judge_rest(grid, labels, is_rest, is_component=options.profile is None)
     is_history = not labels.steps and bool((labels.step >= 0).any())
-    is_plain = profile is None and not _has_config_texts(table)
+    is_plain = options.profile is None and not _has_config_texts(table)
     # the steps of a placeholder's sweep were never played
     steps = labels.steps or (() if is_history or is_plain else config.steps)
     config = replace(config, drive=replace(config.drive, steps=steps))
     mass_text = "unit mass" if mass_kg is None else f"{mass_kg:g} kg"
     missing_profile = (NO_PROFILE.format(mass=mass_text),) if is_plain else ()
-    notes = (*missing_profile, *samples_read.notes, *labels.messages, _describe_steps(labels))
+    notes = (*missing_profile, *samples.notes, *labels.messages, _describe_steps(labels))
+    run = make_run_id(file.stem)
+    start = replace(
+        config.make_start_factory(run, "table")({}, 0.0),
+        channels=grid.channels,
+        planned_samples=grid.size,
+    )
+    items = _iter_items(file, start, grid, labels, notes)
+    if "table_acc_m_s2" in grid.channels:
+        compile_kernels(config)
+        items = add_twin_items(items, config.prepare_twin())
     gaps = 0
-    with RunProgress(console, len(steps), grid.size) as progress:
 
-        def on_item(item: Item) -> None:
-            nonlocal gaps
-            gaps += isinstance(item, SampleGap)
-            progress(item)
+    def count_gaps(item: Item) -> None:
+        nonlocal gaps
+        gaps += isinstance(item, SampleGap)
+        on_item(item)
 
-        run = make_run_id(file.stem)
-        start = replace(
-            config.make_start_factory(run, "table")({}, 0.0),
-            channels=grid.channels,
-            planned_samples=grid.size,
-        )
-        items = _iter_items(file, start, grid, labels, notes)
-        if "table_acc_m_s2" in grid.channels:
-            compile_kernels(config)
-            items = add_twin_items(items, config.prepare_twin())
-        out.parent.mkdir(parents=True, exist_ok=True)
-        record_items(items, out, run, samples_read.rate_hz, on_item)
-    print_line(f"{grid.size} samples of {len(grid.channels)} channels, {gaps} gaps -> {out}")
-    return EXIT_GAPS if gaps else 0
+    out.parent.mkdir(parents=True, exist_ok=True)
+    record_items(items, out, run, samples.rate_hz, count_gaps)
+    return Imported(out, grid.size, grid.channels, gaps, notes)
+
+
+def propose_import(file: Path, options: ImportOptions) -> MapProposal:
+    """Return the proposed map of the columns of a file."""
+    if options.profile is not None:
+        load_profile(options.profile)
+    table = read_table(file)
+    known = ImportColumns(read_channels(_read_rig_toml(table, options)))
+    return propose_map(table, known, options.settings)
 
 
 def _accept_proposal(
-    table: ForeignTable, known: ImportColumns, options: ImportOptions, profile: Path | None
+    table: ForeignTable, known: ImportColumns, options: ImportOptions
 ) -> ColumnMap:
     """Return the proposed map; raise InputError if it is open. A profile states its own mass."""
     proposal = propose_map(table, known, options.settings)
@@ -197,7 +219,8 @@ def _accept_proposal(
             remedy="save it by --save-map MAP, answer there, and import with --columns MAP",
         )
     column_map = proposal.to_map()
-    return column_map if profile is None else column_map.model_copy(update={"mass_kg": None})
+    has_profile = options.profile is not None
+    return column_map.model_copy(update={"mass_kg": None}) if has_profile else column_map
 
 
 def _detect_labels(grid: _SampleGrid, config: RunConfig, on_grid: bool) -> DetectedSteps:
@@ -256,20 +279,14 @@ def _measure_rest_offsets(grid: _SampleGrid, labels: DetectedSteps) -> dict[str,
     return offsets
 
 
-def print_contents(file: Path, columns: Path | None) -> None:
-    """Print the contents of a file, one line per column."""
-    column_map = read_column_map(columns)
-    for line in read_table(file, column_map.group if column_map is not None else "").contents:
-        print_line(line)
-
-
 def _has_config_texts(table: ForeignTable) -> bool:
     """Return whether the table carries profile, rig and model, as an export does."""
     return len(table.texts) == len(TOML_TEXTS)
 
 
-def read_rig_toml(table: ForeignTable, profile: Path | None, rig: str | None) -> str:
+def _read_rig_toml(table: ForeignTable, options: ImportOptions) -> str:
     """Read the text of the rig file: the one given, else of the table, else of the profile."""
+    profile, rig = options.profile, options.rig
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
     option = "" if rig is None else "--rig"
@@ -282,14 +299,14 @@ def read_rig_toml(table: ForeignTable, profile: Path | None, rig: str | None) ->
 
 def _build_run_config(
     table: ForeignTable,
-    profile: Path | None,
+    options: ImportOptions,
     rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,
-    mass_kg: float | None = None,
+    mass_kg: float | None,
 ) -> RunConfig:
     """Build the run config of the log, with the sampling rate of the file."""
-    file = table.path
+    file, profile = table.path, options.profile
     if profile is None and _has_config_texts(table):
         profile_toml, model_toml = table.texts["profile_toml"], table.texts["model_toml"]
         file_profile = parse_toml(profile_toml, Profile, f"profile in {file}")
