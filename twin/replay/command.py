@@ -3,7 +3,7 @@
 import csv
 import math
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from twin.setup.run_config import RunConfig
 from twin.setup.warm_up import compile_kernels
 from twin.system.progress import RunProgress
 from twin.system.terminal import console, print_line, print_table
-from twin.system.versions import find_version_changes, format_version_changes
+from twin.system.versions import VersionPairs, find_version_changes, format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item
 from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC
 
@@ -146,11 +146,38 @@ def _replay_one(request: ReplayRequest) -> int:
         identity = replay_recording(
             recorded, config, folder / "run.mcap", run, on_item, span, block_samples
         )
-    comparison = describe_replay(recorded, config, model, identity, folder / "run.mcap")
-    code = finalize_run(folder, config, request.view, {"replay": comparison})
-    print_line(format_identity(identity, comparison))
+    entry = describe_replay(recorded, config, model, identity, folder / "run.mcap")
+    code = finalize_run(folder, config, request.view, {"replay": asdict(entry)})
+    print_line(format_identity(identity, entry))
     same = config.model_toml == recorded.start.model_toml
     return EXIT_NOT_IDENTICAL if same and identity.differs else code
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayEntry:
+    """Entry `replay` of a replay's summary.json; the fields, in this order, are its keys."""
+
+    of: str
+    run: str
+    model: str | None
+    identical: bool | None
+    beginning: str | None
+    comparisons: int
+    compared: int
+    differing: int
+    missing: int
+    unrecorded: int
+    lost_with_twin: int
+    hashes: int
+    hashes_compared: int
+    hashes_differing: int
+    predictions_compared: int
+    predictions_differing: int
+    first_difference_index: int | None
+    largest_difference_of_error_sums: dict[str, float]
+    relative_difference: dict[str, float | None]
+    versions_differing: VersionPairs
+    recorded_comparison: dict[str, dict[str, float | None]]
 
 
 def describe_replay(
@@ -159,43 +186,43 @@ def describe_replay(
     model: str | None,
     identity: ReplayComparison,
     log: Path,
-) -> summaries.Json:
-    """Compare a replay with its recording; return the entry `replay` of its summary.json."""
+) -> ReplayEntry:
+    """Compare a replay with its recording."""
     recording = recorded.recording
     same = config.model_toml == recording.start.model_toml
     payloads = [payload for _, payload in sorted(recorded.comparisons.items())]
     recorded_items = [*iter_valid_items(CMP_TOPIC, payloads, recording.start, [])]
-    return {
-        "of": str(recording.path),
-        "run": recording.run,
-        "model": RECORDED if same else model,
-        "identical": identity.is_identical,
-        "beginning": identity.beginning or None,
-        "comparisons": identity.recorded,
-        "compared": identity.compared,
-        "differing": identity.differing,
-        "missing": identity.missing,
-        "unrecorded": identity.unrecorded,
-        "lost_with_twin": identity.lost_with_twin,
-        "hashes": identity.hashes,
-        "hashes_compared": identity.hashes_compared,
-        "hashes_differing": identity.hashes_differing,
-        "predictions_compared": identity.predictions_compared,
-        "predictions_differing": identity.predictions_differing,
-        "first_difference_index": identity.first_difference,
-        "largest_difference_of_error_sums": identity.largest,
-        "relative_difference": compute_deviation(recording.path, log) if identity.differs else {},
-        "versions_differing": find_version_changes(recording.start.versions),
-        "recorded_comparison": summaries.channel_nrmse(
+    return ReplayEntry(
+        of=str(recording.path),
+        run=recording.run,
+        model=RECORDED if same else model,
+        identical=identity.is_identical,
+        beginning=identity.beginning or None,
+        comparisons=identity.recorded,
+        compared=identity.compared,
+        differing=identity.differing,
+        missing=identity.missing,
+        unrecorded=identity.unrecorded,
+        lost_with_twin=identity.lost_with_twin,
+        hashes=identity.hashes,
+        hashes_compared=identity.hashes_compared,
+        hashes_differing=identity.hashes_differing,
+        predictions_compared=identity.predictions_compared,
+        predictions_differing=identity.predictions_differing,
+        first_difference_index=identity.first_difference,
+        largest_difference_of_error_sums=identity.largest,
+        relative_difference=compute_deviation(recording.path, log) if identity.differs else {},
+        versions_differing=find_version_changes(recording.start.versions),
+        recorded_comparison=summaries.channel_nrmse(
             tuple(item for item in recorded_items if isinstance(item, Comparison)),
             config.parameters,
             config.rig.channel_by_name,
             summaries.find_channel_noise(recording),
         ),
-    }
+    )
 
 
-def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> str:
+def format_identity(identity: ReplayComparison, entry: ReplayEntry) -> str:
     """Format in one line whether a replay is identical, or the differences and their cause."""
     if identity.is_identical:
         lost = identity.lost_with_twin
@@ -214,10 +241,10 @@ def format_identity(identity: ReplayComparison, comparison: summaries.Json) -> s
             f"of {identity.hashes} hashes of predictions {identity.hashes_differing} differ, "
             f"{identity.hashes - identity.hashes_compared} missing"
         )
-    if comparison["relative_difference"]:
-        parts.append(describe_deviation(comparison["relative_difference"]))
-    if comparison["model"] == RECORDED:
-        version_changes = format_version_changes(comparison["versions_differing"])
+    if entry.relative_difference:
+        parts.append(describe_deviation(entry.relative_difference))
+    if entry.model == RECORDED:
+        version_changes = format_version_changes(entry.versions_differing)
         parts.append(f"versions: {version_changes or 'all that were recorded are the same'}")
     return "; ".join([*parts, "see summary.json, replay"])
 
@@ -265,15 +292,15 @@ def replay_all(request: ReplayRequest) -> int:
             identity = replay_recording(
                 recorded, config, new_log, replay_folder.name, lambda _: None, span
             )
-            comparison = describe_replay(recorded, config, model, identity, new_log)
+            entry = describe_replay(recorded, config, model, identity, new_log)
             summary = summaries.summarise(
                 read_recording(new_log, TOPIC_TYPES.keys() - {PRED_TOPIC}), config.parameters
             )
             summaries.write_summary(
-                {**summary, "replay": comparison}, replay_folder / "summary.json"
+                {**summary, "replay": asdict(entry)}, replay_folder / "summary.json"
             )
-            print_line(f"{replay_folder.name}: {format_identity(identity, comparison)}")
-            rows.append({"log": name, "model": model, **_make_row(summary, comparison)})
+            print_line(f"{replay_folder.name}: {format_identity(identity, entry)}")
+            rows.append({"log": name, "model": model, **_make_row(summary, entry)})
     _write_comparison(folder, rows)
     print_table(console, _make_table(rows))
     print_line(f"{folder / 'comparison.csv'}, {folder / 'comparison.json'}; a page of one: "
@@ -322,7 +349,7 @@ def _name_logs(logs: list[Path]) -> list[str]:
     return names
 
 
-def _make_row(summary: summaries.Json, comparison: summaries.Json) -> Row:
+def _make_row(summary: summaries.Json, entry: ReplayEntry) -> Row:
     """Return the comparison of one replay; errors as ratios, None if not comparable."""
     nrmse = {
         f"{kind} {channel}": values[kind]
@@ -335,8 +362,8 @@ def _make_row(summary: summaries.Json, comparison: summaries.Json) -> Row:
         if step["measured"] and step["twin"]
     ]
     return {
-        "same_model": comparison["model"] == RECORDED,
-        "identical": comparison["identical"],
+        "same_model": entry.model == RECORDED,
+        "identical": entry.identical,
         "gaps": summary["gaps"],
         **nrmse,
         **{f"prc {name}": _prc_error(pairs, name) for name in PRC_QUANTITIES},

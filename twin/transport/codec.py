@@ -6,7 +6,7 @@ languages generate their classes from it. Only this package imports protobuf.
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache, lru_cache, partial
 from pathlib import Path
@@ -26,7 +26,6 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from table_io.block import Block, Float2D
 from table_io.records import (
-    RECORD_TYPES,
     Agreement,
     Check,
     Comparison,
@@ -57,54 +56,36 @@ from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC, HASH_TOPIC
 
 Item = Block | Record
 
-RECORD_TOPICS: dict[type, str] = {
-    RunStart: "/run/start",
-    RunStop: "/run/stop",
-    Event: "/run/event",
-    Fault: "/run/fault",
-    SampleGap: "/rig/gap",
-    Check: "/rig/check",
-    FrequencyResponse: "/rig/response",
-    Level: "/rig/level",
-    StepAdded: "/rig/decided",
-    OrbitPoint: "/rig/orbit",
-    Trip: "/rig/trip",
-    Params: "/twin/params",
-    Comparison: CMP_TOPIC,
-    PredictionHash: HASH_TOPIC,
-    CycleExtremes: "/twin/cycle",
-    PrcPoint: "/twin/point",
-    Agreement: "/twin/agreement",
-    Estimate: "/twin/estimate",
-    JumpForecast: "/twin/ahead",
-    Timing: "/run/timing",
+# Topic of each record type and its message in `shaketwin.proto`, which outlive names of classes.
+RECORD_MESSAGES: dict[type, tuple[str, str]] = {
+    RunStart: ("/run/start", "RunStart"),
+    RunStop: ("/run/stop", "RunStop"),
+    Event: ("/run/event", "Event"),
+    Fault: ("/run/fault", "Fault"),
+    SampleGap: ("/rig/gap", "Gap"),
+    Check: ("/rig/check", "Check"),
+    FrequencyResponse: ("/rig/response", "Response"),
+    Level: ("/rig/level", "Level"),
+    StepAdded: ("/rig/decided", "Decided"),
+    OrbitPoint: ("/rig/orbit", "Orbit"),
+    Trip: ("/rig/trip", "Trip"),
+    Params: ("/twin/params", "Params"),
+    Comparison: (CMP_TOPIC, "Comparison"),
+    PredictionHash: (HASH_TOPIC, "PredictionHash"),
+    CycleExtremes: ("/twin/cycle", "Cycle"),
+    PrcPoint: ("/twin/point", "Point"),
+    Agreement: ("/twin/agreement", "Agreement"),
+    Estimate: ("/twin/estimate", "Estimate"),
+    JumpForecast: ("/twin/ahead", "Ahead"),
+    Timing: ("/run/timing", "Timing"),
 }
-# Message names in `shaketwin.proto`: they stay when a class is renamed.
-MESSAGE_NAMES = {
+RECORD_TOPICS = {kind: topic for kind, (topic, _) in RECORD_MESSAGES.items()}
+MESSAGE_NAMES: dict[type, str] = {
     Block: "Block",
     Step: "Step",
     Extremes: "Extremes",
     NormalizedResponse: "Quantities",
-    RunStart: "RunStart",
-    RunStop: "RunStop",
-    Event: "Event",
-    Fault: "Fault",
-    SampleGap: "Gap",
-    Check: "Check",
-    FrequencyResponse: "Response",
-    Level: "Level",
-    StepAdded: "Decided",
-    OrbitPoint: "Orbit",
-    Trip: "Trip",
-    Params: "Params",
-    Comparison: "Comparison",
-    PredictionHash: "PredictionHash",
-    CycleExtremes: "Cycle",
-    PrcPoint: "Point",
-    Agreement: "Agreement",
-    Estimate: "Estimate",
-    JumpForecast: "Ahead",
-    Timing: "Timing",
+    **{kind: name for kind, (_, name) in RECORD_MESSAGES.items()},
 }
 TOPIC_TYPES: dict[str, type] = {
     **dict.fromkeys(BLOCK_TOPICS.values(), Block),
@@ -311,11 +292,6 @@ def _to_record(kind: Any, message: Any) -> Any:
             for name, optional, make in _CONVERSION_PLANS[kind]
         }
     )
-
-
-def item_types() -> Iterable[type]:
-    """Return all item types that have a topic."""
-    return (Block, *RECORD_TYPES)
 
 
 def regenerate_protobuf() -> None:
