@@ -20,6 +20,7 @@ COMMENT_MARKS = "#%!/;*'"
 CONVERTED_MARK = "# variable "  # begins the remark above the columns of a converted record
 MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which cells are text
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+UNIT_LINE = re.compile(r"\W*units?\s*[:=]\s*(\S+)", re.IGNORECASE)
 DAY_S = 86400.0
 CLOCK = re.compile(
     r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+)?"
@@ -80,7 +81,11 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
     units = tuple(
         unit or find_unit(name) for unit, name in zip(units, names or units, strict=False)
     )
-    facts = read_facts(" ".join(rows[k]).strip() for k in above)
+    remarks = [" ".join(rows[k]).strip() for k in above]
+    if units == ("",):  # of a single column a line of its own may state the unit
+        stated = [match[1] for line in remarks if (match := UNIT_LINE.match(line))]
+        units = tuple(normalize_unit(unit) for unit in stated[:1]) or units
+    facts = read_facts(remarks)
     samples = sum(_is_alike(kinds[k].ljust(len(kind)), kind) for k in filled[first:])
     spare = names[len(kind) :]
     return TableLayout(names[: len(kind)], units, index, kind, commas, spare, samples, facts)

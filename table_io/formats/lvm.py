@@ -1,49 +1,28 @@
 """Reader of LabVIEW measurement files, .lvm: text with a header a file and a header a segment.
 
-Source: NI, "Specification for the LabVIEW Measurement File (.lvm)", version 2. Columns are those of
-the Y values; the last cell of a row may be a comment.
+Source: NI, "Specification for the LabVIEW Measurement File (.lvm)", version 2. The last cell of a
+row may be a comment.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TextIO
 
 import numpy as np
 
-from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
-from table_io.formats.table import ForeignColumn, ForeignTable
+from table_io.formats.cells import read_cells
+from table_io.formats.layout import TableLayout, is_number
+from table_io.formats.table import ForeignColumn, ForeignTable, make_column
 
 FIRST_WORDS = "LabVIEW Measurement"
 KIND = "a LabVIEW measurement file (.lvm)"
 HEADER_END = "***End_of_Header***"
-SEPARATORS = {"Tab": "\t", "Comma": ",", "Semicolon": ";"}
-
-
-@dataclass(frozen=True, eq=False)
-class _LvmSegment:
-    """Channels of one segment: names, units, intervals and first times in s; values (cell, row)."""
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    intervals_s: tuple[float, ...]
-    starts_s: tuple[float, ...]
-    sizes: tuple[int, ...]
-    values: Float2D
-    first_row: int
-
-    def times(self, k: int, x_columns: str) -> Float1D:
-        """Return the times of channel `k` in s, (row,): those in the file, or of its interval."""
-        if x_columns == "No":
-            return np.asarray(
-                self.starts_s[k] + self.intervals_s[k] * np.arange(self.sizes[k]), dtype=np.float64
-            )
-        return self.values[2 * k if x_columns == "Multi" else 0, : self.sizes[k]]
-
-    def channel(self, k: int, x_columns: str) -> Float1D:
-        """Return the values of channel `k`, (row,)."""
-        return self.values[2 * k + 1 if x_columns == "Multi" else k + 1, : self.sizes[k]]
+SEPARATORS = {"Tab": "\t", "Comma": ","}
+CLOCK = "X_Value"
+Columns = dict[str, ForeignColumn]
 
 
 def parse_lvm(file: TextIO, path: Path) -> ForeignTable:
@@ -54,137 +33,89 @@ def parse_lvm(file: TextIO, path: Path) -> ForeignTable:
         raise InputError(
             f"{KIND}: it has no segment of samples", where=path, remedy="export TDMS or CSV"
         )
-    header = _read_keys(lines[: ends[0]], None)
-    separator = SEPARATORS.get(header.get("Separator", ["Tab"])[0], "\t")
-    has_commas = header.get("Decimal_Separator", ["."])[0] == ","
-    x_columns = header.get("X_Columns", ["One"])[0]
-    begins = [k for k, line in enumerate(lines) if line.split(separator)[0] == "Channels"]
+    mark = "\t" if "\t" in lines[1] else ","
+    header = {
+        key: cells[0] for line in lines[: ends[0]] for key, *cells in [line.split(mark)] if cells
+    }
+    separator = SEPARATORS.get(header.get("Separator", "").strip(), "\t")
+    rows = [[cell.strip() for cell in line.split(separator)] for line in lines]
+    begins = [k for k, row in enumerate(rows) if row[0] == "Channels"]
     segments = [
-        _read_segment(lines, begin, end, after, separator, has_commas, x_columns, path)
-        for begin, end, after in zip(begins, ends[1:], [*begins[1:], len(lines)], strict=False)
+        _read_segment(rows, begin, end, after, header, path)
+        for begin, end, after in zip(begins, ends[1:], [*begins[1:], len(rows)], strict=False)
     ]
-    table = ForeignTable(path, KIND, first_row=segments[0].first_row)
-    joined = _join_segments(segments, x_columns)
-    if joined is not None:
-        _add_segment(table, joined, x_columns, is_joined=len(segments) > 1)
-    else:
-        for number, segment in enumerate(segments, 1):
-            _add_segment(table, segment, x_columns, f"segment {number}")
-    if len(segments) > 1:
-        how = "joined" if joined is not None else "each one is a group; time does not go on"
-        table = replace(table, notes=(f"{len(segments)} segments, {how}",))
-    return table
+    table = ForeignTable(path, KIND, segments[0], first_row=ends[1] + 3)
+    if len(segments) == 1:
+        return table
+    if all(_goes_on(before, after) for before, after in pairwise(segments)):
+        joined = {
+            name: [np.asarray(segment[name].values) for segment in segments] for name in segments[0]
+        }
+        columns = {
+            name: replace(segments[0][name], size=sum(map(np.size, parts)), values=np.hstack(parts))
+            for name, parts in joined.items()
+        }
+        return replace(table, columns=columns, notes=(f"{len(segments)} segments, joined",))
+    columns = {}
+    for number, segment in enumerate(segments, 1):
+        group = f"segment {number}"
+        columns |= {
+            f"{group}/{name}": replace(
+                column, group=group, clock=column.clock and f"{group}/{column.clock}"
+            )
+            for name, column in segment.items()
+        }
+    note = f"{len(segments)} segments, each one is a group: time does not go on"
+    return replace(table, columns=columns, notes=(note,))
 
 
-def _read_keys(lines: list[str], separator: str | None) -> dict[str, list[str]]:
-    """Return the cells of each line by its first one."""
-    keys = {}
-    for line in lines:
-        mark = separator or ("\t" if "\t" in line else "," if "," in line else ";")
-        key, *cells = (cell.strip() for cell in line.split(mark))
-        keys[key] = cells
-    return keys
-
-
-def _read_segment(
-    lines: list[str], begin: int, end: int, after: int, separator: str, has_commas: bool,
-    x_columns: str, path: Path,
-) -> _LvmSegment:  # fmt: skip
-    """Read the segment whose header is in lines `begin` to `end`, its samples before `after`."""
-    keys = _read_keys(lines[begin:end], separator)
-    names = [name.strip() for name in lines[end + 1].split(separator)]
-    if names[-1] in ("Comment", ""):
-        names.pop()
-    width = len(names)
-    names = names[1::2] if x_columns == "Multi" else names[1:]
-    count = len(names)
-    rows = []
-    for number, line in enumerate(lines[end + 2 : after], end + 3):
-        if not line.strip():
-            continue
-        cells = [cell.strip() for cell in line.split(separator)][:width]
-        try:
-            numbers = [
-                float(cell.replace(",", ".") if has_commas else cell) if cell else np.nan
-                for cell in cells
-            ]
-        except ValueError:
-            raise InputError(
-                f"{KIND}: {line.strip()[:40]!r} is no row of numbers", where=f"{path}: row {number}"
-            ) from None
-        rows.append(numbers + [np.nan] * (width - len(numbers)))
-
-    def read_numbers(key: str) -> tuple[float, ...]:
-        cells = [cell.replace(",", ".") for cell in keys.get(key, [])[:count]]
-        numbers = [float(cell) if cell else 0.0 for cell in cells]
-        return (*numbers, *[0.0] * (count - len(numbers)))
-
-    values = np.array(rows, dtype=np.float64).reshape(-1, width).T
-    sizes = [min(int(size) or values.shape[1], values.shape[1]) for size in read_numbers("Samples")]
-    units = [unit or "" for unit in keys.get("Y_Unit_Label", [])[:count]]
-    units += [""] * (count - len(units))
-    return _LvmSegment(
-        (*names,),
-        (*units,),
-        read_numbers("Delta_X"),
-        read_numbers("X0"),
-        (*sizes,),
-        values,
-        end + 3,
+def _goes_on(before: Columns, after: Columns) -> bool:
+    """Return True if a segment has the channels and units of the one before it, and later times."""
+    units = [{name: column.unit for name, column in part.items()} for part in (before, after)]
+    clocks = [name for name in before if name.startswith(CLOCK)]
+    return units[0] == units[1] and all(
+        after[name].values[0] > before[name].values[-1]  # type: ignore[index]
+        for name in clocks
     )
 
 
-def _join_segments(segments: list[_LvmSegment], x_columns: str) -> _LvmSegment | None:
-    """Return all segments as one; None if their channels differ or time does not go on."""
-    first = segments[0]
-    for before, segment in pairwise(segments):
-        is_same = (segment.names, segment.units, segment.intervals_s) == (
-            first.names, first.units, first.intervals_s,
-        )  # fmt: skip
-        if not is_same or len({*segment.sizes}) > 1 or not before.sizes[0]:
-            return None
-        if not segment.times(0, x_columns)[0] > before.times(0, x_columns)[-1]:
-            return None
-    if len(segments) == 1:
-        return first
-    values = [segment.values[:, : segment.sizes[0]] for segment in segments]
-    if x_columns == "No":
-        times = np.concatenate([segment.times(0, x_columns) for segment in segments])
-        joined = np.concatenate(values, axis=1)
-        joined[0] = times
-    else:
-        joined = np.concatenate(values, axis=1)
-    return replace(first, values=joined, sizes=(joined.shape[1],) * len(first.names))
-
-
-def _add_segment(
-    table: ForeignTable,
-    segment: _LvmSegment,
-    x_columns: str,
-    group: str = "",
-    is_joined: bool = False,
-) -> None:
-    prefix = f"{group}/" if group else ""
-    has_times = x_columns != "No" or is_joined
-    if has_times and x_columns == "No":
-        x_columns = "One"
-    for k, name in enumerate(segment.names):
-        clock = ""
-        if has_times:
-            clock = f"{prefix}X_Value" + (f" of {name}" if x_columns == "Multi" else "")
-            times = segment.times(k, x_columns)
-            table.columns.setdefault(
-                clock, ForeignColumn(times.size, (0,), "s", group=group, values=times.copy())
-            )
-        values = segment.channel(k, x_columns).copy()
-        interval_s = segment.intervals_s[k]
-        table.columns[prefix + name] = ForeignColumn(
-            values.size,
-            (k + 1,),
-            segment.units[k],
-            1.0 / interval_s if interval_s > 0 else None,
-            segment.starts_s[k],
-            clock,
-            group,
-            values,
+def _read_segment(
+    rows: Sequence[list[str]], begin: int, end: int, after: int, header: dict[str, str], path: Path
+) -> Columns:
+    """Read the columns of the segment whose header is in rows `begin` to `end`."""
+    keys = {row[0]: row[1:] for row in rows[begin:end]}
+    names = rows[end + 1]
+    if names[-1] in ("Comment", ""):
+        names = names[:-1]
+    x_columns = header.get("X_Columns", "One").strip()
+    if x_columns == "Multi":
+        names = [name if k % 2 else f"{CLOCK} of {names[k + 1]}" for k, name in enumerate(names)]
+    layout = TableLayout(
+        (*names,), ("",) * len(names), end + 2, "n" * len(names),
+        header.get("Decimal_Separator", ".").strip() == ",", ("Comment",),
+    )  # fmt: skip
+    samples = ((number, row) for number, row in enumerate(rows[:after], 1) if number > end + 2)
+    part = read_cells(path, KIND, layout, ((n, row) for n, row in samples if any(row)))
+    channels = [name for name in names if not name.startswith(CLOCK)]
+    columns: Columns = {}
+    for k, name in enumerate(channels):
+        if name not in part.columns:  # no numbers, or two channels of this name
+            continue
+        unit, size_text, start_text, interval_text = (
+            (keys.get(key, []) + [""] * len(channels))[k].replace(",", ".")
+            for key in ("Y_Unit_Label", "Samples", "X0", "Delta_X")
         )
+        size = int(size_text) if size_text.isdigit() else part.columns[name].size
+        start_s, interval_s = (
+            float(text) if is_number(text) else 0.0 for text in (start_text, interval_text)
+        )
+        clock = f"{CLOCK} of {name}" if x_columns == "Multi" else CLOCK
+        values, times = part.read_column(name)[:size], part.read_column(clock)[:size]
+        if x_columns == "No":
+            times = np.asarray(start_s + interval_s * np.arange(values.size), dtype=np.float64)
+        columns.setdefault(clock, make_column(times, "s", 0))
+        rate_hz = 1.0 / interval_s if interval_s > 0 else None
+        columns[name] = ForeignColumn(
+            values.size, (k + 1,), unit, rate_hz, start_s, clock, values=values
+        )
+    return columns

@@ -25,6 +25,7 @@ from table_io.formats.words import (
     find_quantity,
     find_stated_unit,
     find_unit,
+    is_unit,
     normalize_unit,
 )
 from table_io.units import UNITS
@@ -206,19 +207,25 @@ def _format_columns(table: ForeignTable, name: str, variable: str | None) -> str
             remedy="set variable",
         )
     table.check_size(names)
-    rows = np.column_stack([table.read_column(column) for column in names]).tolist()
+    values = {}
+    for column in names:
+        try:
+            values[column] = table.read_column(column).tolist()
+        except InputError:  # complex or infinite; a file may hold such arrays next to its record
+            if len(names) == 1:
+                raise
+    rows = [*zip(*values.values(), strict=True)]
     out = io.StringIO()
-    rates = {table.columns[column].rate_hz for column in names} - {None}
     if variable is not None or len(arrays) == 1:
-        out.write(f"# variable {variable or next(iter(arrays))} of {name}, ")
-        out.write(f"{len(rows)} x {len(names)}\n")
+        key = variable or next(iter(arrays))
+        out.write(f"# variable {key} of {name}, {len(rows)} x {len(values)}\n")
     else:
+        rates = {table.columns[column].rate_hz for column in values} - {None}
         out.writelines(f"# rate_hz = {rate_hz!r}\n" for rate_hz in rates)
-        units = {column: normalize_unit(table.columns[column].unit) for column in names}
-        header = [
-            f"{column} [{unit}]" if unit and not find_unit(column) else column
-            for column, unit in units.items()
-        ]
-        csv.writer(out, lineterminator="\n").writerow(header)
+        units = [normalize_unit(table.columns[column].unit) for column in values]
+        units = [unit if is_unit(unit) else "" for unit in units]
+        csv.writer(out, lineterminator="\n").writerows(
+            [[*values], *([units] if any(units) else [])]
+        )
     out.writelines(",".join(map(repr, row)) + "\n" for row in rows)
     return out.getvalue()

@@ -20,6 +20,7 @@ from table_io.config.excitation.record_files import (
 )
 from table_io.config.profile import Profile, load_profile
 from tests.input_errors import raises_input_error
+from tests.table_io.formats.test_formats import DISP, FORMATS, RATE
 
 VALUES = [round(0.01 * (-1) ** k * (k + 1), 3) for k in range(20)]
 TEST = """title = "a record"
@@ -250,6 +251,51 @@ def test_an_unclear_array_is_refused_with_those_that_there_are(suffix: str, make
     with raises_input_error(where=f"x.{suffix}", remedy="export it again"):
         convert_binary(data[: len(data) // 2], f"x.{suffix}", None)
     assert convert_binary(data, f"x.{suffix}", "ew").count("\n") == 31
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_convert_file_of_every_format_of_an_import(kind: str, tmp_path: Path) -> None:
+    """A record and an import read the same formats, and the same numbers."""
+    name, write, _ = FORMATS[kind]
+    write(tmp_path / name)
+    text = RecordedHistory.convert_file((tmp_path / name).read_bytes(), name, {})[name]
+    column = "both:1" if kind == "npz" else "u"
+    has_unit = kind in ("hdf5", "tdms", "uff binary", "uff text")
+    keys: dict[str, Any] = {"column": "test/u" if kind == "mat v5" else column}
+    series = read(text, name, **keys, unit=None if has_unit else "mm")
+    assert (series.quantity, series.rate_hz) == ("displacement", pytest.approx(RATE))
+    np.testing.assert_allclose(series.values, 1e-3 * DISP, rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("\ufeffTime [s],Acceleration [g]\n" + "{rows,}", "x.csv"),
+        ("A quake\nSource: nobody\nTime[s] Accel[g]\n" + "{rows\t}", "x.dat"),
+        ("Zeit (ms);Beschl (g)\n" + "{milli;}", "x.csv"),
+        ("t,a_g,state\n" + "{states,}", "x.csv"),
+        (",t,a_g\n" + "{index,}", "x.csv"),
+        ("Station Code / Name   : 1 / Nowhere\nTime Increment (s)    : 0.01\nData (g)    :\n{one}",
+         "x.acc"),
+        ("EVENT: x\nSAMPLING_INTERVAL_S: 0.010000\nUNITS: g\nUSER5:\n{one}", "x.asc"),
+    ],
+)  # fmt: skip
+def test_read_series_of_tables_that_an_import_reads(text: str, name: str) -> None:
+    times = [f"{0.01 * k:.2f}" for k in range(20)]
+    rows = [*zip(times, map(str, VALUES), strict=True)]
+    lines = {
+        "{rows,}": [",".join(row) for row in rows],
+        "{rows\t}": ["\t".join(row) for row in rows],
+        "{milli;}": [f"{10 * k},0;{value}".replace(".", ",") for k, value in enumerate(VALUES)],
+        "{states,}": [",".join((*row, "OK")) for row in rows],
+        "{index,}": [",".join((str(k), *row)) for k, row in enumerate(rows)],
+        "{one}": [*map(str, VALUES)],
+    }
+    for mark, samples in lines.items():
+        text = text.replace(mark, "\n".join(samples))
+    series = read(text, name)
+    assert (series.quantity, series.rate_hz) == ("acceleration", pytest.approx(100.0))
+    np.testing.assert_allclose(series.values, 9.80665 * np.array(VALUES))
 
 
 def test_a_fault_of_a_binary_file_names_profile_file_and_key(tmp_path: Path) -> None:
