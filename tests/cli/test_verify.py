@@ -181,7 +181,7 @@ def test_repair_never_writes_over_anything(log: Path) -> None:
     assert log.read_bytes() == before
 
 
-def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+def test_missing_log_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time_s\n1\n")
     with raises_input_error(where=tmp_path / "a.csv", remedy="run.mcap"):
         verify(tmp_path / "a.csv")

@@ -52,7 +52,7 @@ def test_the_time_that_is_waited_for_the_controller_needs_room() -> None:
 
 
 @pytest.mark.parametrize("follows", [False, True])
-def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None:
+def test_held_back_blocks_have_no_latency(follows: bool) -> None:
     absent: Any = None
     twin = TwinProcess("r", absent, absent, absent, absent, "", external_clock=follows)
     start = RunStart(
@@ -62,12 +62,12 @@ def test_no_latency_is_told_of_blocks_that_were_held_back(follows: bool) -> None
     assert twin.epoch_s == (None if follows else 5.0)
 
 
-def test_a_stopwatch_that_saw_nothing_says_no_latency() -> None:
+def test_histogram_without_blocks_has_no_latency() -> None:
     timing = summarise_timing((Timing(0, "twin", 0.0, 0.0, 0.0, 0, 0, 0.1, "normal"),))
     assert timing["latency_ms"] == {"p50": None, "p99": None, "max": None}
 
 
-def test_an_address_that_is_no_name_is_told() -> None:
+def test_malformed_address_is_reported() -> None:
     pytest.importorskip("opendaq")
     rig, _ = load_config(find_config("follow_simulated", "rigs"), RigConfig, "card")
     wiring = rig.get_section(OpenDaqWiring)

@@ -171,9 +171,7 @@ def wait_until_delivered(rig: Rig, inbox: ReliableSubscriber) -> None:
         pass
 
 
-def test_what_comes_out_is_what_was_said_inside_byte_for_byte(
-    observer: BusLink, rig: Rig, spec: ProcessConfig
-) -> None:
+def test_gateway_relays_bytes_unchanged(observer: BusLink, rig: Rig, spec: ProcessConfig) -> None:
     random.seed(1)
     sizes = [10, 2500, 48 * 2**10, 200_000, 0]
     rig.waiting += [(MEAS_TOPIC, random.randbytes(size)) for size in sizes]
@@ -187,7 +185,7 @@ def test_what_comes_out_is_what_was_said_inside_byte_for_byte(
     ]
 
 
-def test_a_successor_leaves_no_gap_and_doubles_nothing(
+def test_restarted_gateway_leaves_no_gap_and_no_duplicate(
     observer: BusLink, rig: Rig, spec: ProcessConfig, door: list[Door]
 ) -> None:
     before = len([sent for sent in rig.sent if sent[0] == "/twin/cmp"])
@@ -231,7 +229,7 @@ def test_status_and_configuration_answer(observer: BusLink, rig: Rig) -> None:
     assert status["verdict"] is None
 
 
-def test_an_observer_is_seen_while_it_is_there(observer: BusLink, spec: ProcessConfig) -> None:
+def test_observer_is_listed_while_connected(observer: BusLink, spec: ProcessConfig) -> None:
     other = connect(spec)
     other.declare_alive("observer.anna.monitor")
     other.declare_alive("observer.\x1b[2J")
@@ -244,9 +242,7 @@ def test_an_observer_is_seen_while_it_is_there(observer: BusLink, spec: ProcessC
     until(lambda: "observer.anna.monitor" not in observer.list_components())
 
 
-def test_who_lives_inside_is_seen_outside_until_it_dies(
-    observer: BusLink, spec: ProcessConfig
-) -> None:
+def test_component_is_listed_outside_until_it_dies(observer: BusLink, spec: ProcessConfig) -> None:
     inside = open_spoke(RIG, spec.endpoint, PATIENCE_S)
     inside.declare_alive(process_token(spec, "viewer"))
     until(lambda: process_token(spec, "viewer") in observer.list_components())
@@ -260,9 +256,7 @@ def test_a_command_reaches_the_rig_signed_and_is_recorded(observer: BusLink, rig
     until(lambda: Event(rig.events[-1].index, "order", "hold: look at it by anna") in rig.events)
 
 
-def test_refused_commands_reach_nobody_and_a_flood_is_one_sentence_now_and_then(
-    observer: BusLink, rig: Rig
-) -> None:
+def test_refused_commands_are_dropped_and_their_events_limited(observer: BusLink, rig: Rig) -> None:
     before, begun = list(rig.orders), time.monotonic()
     assert observer.send_command("stop/\x1b[2J", f"{RUN}\n", PATIENCE_S) is not None
     answers = set()
@@ -302,7 +296,7 @@ def test_observers_hide_no_component_and_are_no_rig(
     other.close()
 
 
-def test_what_observers_publish_or_answer_reaches_nobody(
+def test_publications_and_replies_of_observers_are_dropped(
     observer: BusLink, rig: Rig, spec: ProcessConfig
 ) -> None:
     other = connect(spec)
@@ -325,7 +319,9 @@ def test_what_observers_publish_or_answer_reaches_nobody(
     other.close()
 
 
-def test_garbage_harms_nothing(observer: BusLink, rig: Rig, spec: ProcessConfig) -> None:
+def test_garbage_does_not_disturb_the_gateway(
+    observer: BusLink, rig: Rig, spec: ProcessConfig
+) -> None:
     chance = random.Random(2)
     session = observer._session
     paths = ["state/held", "state/status", "cmd/stop/x", "cmd/stop/*", "**", "config/*", "alive/x"]
@@ -379,7 +375,7 @@ def test_a_command_is_refused_with_the_reason(
     assert bool(problem) == bool(part)
 
 
-def test_refusals_are_told_again_after_a_while() -> None:
+def test_refusals_are_recorded_again_after_a_while() -> None:
     refusals = RefusalLimiter()
     answers = [refusals.limit("no", 0.001 * number) for number in range(1000)]
     assert [answer for answer in answers if answer] == ["no"] * MAX_REFUSAL_BURST
@@ -390,7 +386,7 @@ def test_refusals_are_told_again_after_a_while() -> None:
     assert refusals.limit("no", 11.1) == ""
 
 
-def test_after_the_end_a_gate_waits_for_whoever_still_fetches(
+def test_gateway_waits_for_slow_subscribers_after_the_end(
     spec: ProcessConfig, rig: Rig, door: list[Door]
 ) -> None:
     late = connect(spec)

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.slow
 LONG = QUICK.replace("cycles = 5", "cycles = 20", 1)
 
 
-def test_a_dead_gate_leaves_no_gap_here_nor_there(tmp_path: Path) -> None:
+def test_dead_gateway_leaves_no_gap_in_any_recording(tmp_path: Path) -> None:
     listen = endpoint()
     process = start(tmp_path, "--listen", listen, profile=LONG)
     running(process)

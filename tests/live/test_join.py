@@ -75,7 +75,7 @@ def gate() -> Iterator[Callable[..., str]]:
         thread.join()
 
 
-def test_everything_is_recorded_also_what_came_before_its_start(
+def test_joined_recorder_keeps_messages_before_the_start(
     gate: Callable[..., str], tmp_path: Path
 ) -> None:
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
@@ -99,7 +99,7 @@ class Played:
         return self.left.pop(0) if self.left else None
 
 
-def test_what_comes_before_the_start_is_written_after_it(
+def test_early_messages_are_written_after_the_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(join, "MAX_SILENCE_S", 0.0)
@@ -112,7 +112,7 @@ def test_what_comes_before_the_start_is_written_after_it(
     ]  # fmt: skip
 
 
-def test_a_test_that_goes_silent_leaves_what_came_and_says_so(
+def test_silent_test_ends_the_recording_with_gaps(
     gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(join, "MAX_SILENCE_S", 0.5)
@@ -148,7 +148,7 @@ def test_ctrl_c_ends_the_recording(
 
 
 @pytest.mark.parametrize("run", ["..", "", "a" * 102, "observer.anna.0"])
-def test_no_folder_is_named_by_a_peer_that_sends_no_run(
+def test_invalid_run_id_of_a_peer_names_no_folder(
     gate: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, run: str
 ) -> None:
     monkeypatch.chdir(tmp_path)

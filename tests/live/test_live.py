@@ -205,7 +205,7 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     assert "identical to the bit" in again.stdout
 
 
-def test_what_a_dead_twin_missed_reaches_a_recorder_that_starts_after_the_run(
+def test_fault_of_a_dead_twin_reaches_a_recorder_started_after_the_run(
     tmp_path: Path,
 ) -> None:
     """As on a busy computer: the successors of twin and recorder start when the table rests."""
@@ -339,7 +339,7 @@ def test_a_second_run_at_the_same_endpoint_is_refused_and_harms_nothing(
     assert len(whole_run.summary["steps"]) == 3
 
 
-def test_the_log_tells_the_starts_and_ends_of_the_processes(whole_run: WholeRun) -> None:
+def test_log_file_lists_starts_and_ends_of_processes(whole_run: WholeRun) -> None:
     assert whole_run.code == 0, whole_run.output
     lines = re.findall(r"^\d{4}-\S+ \S+ (shaketwin run|\w+) INFO (.*)$", whole_run.output, re.M)
     processes = ("rig", "gate", "twin", "recorder")

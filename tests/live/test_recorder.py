@@ -142,7 +142,7 @@ def test_a_run_is_complete_with_its_end_all_its_samples_and_the_end_of_the_twin(
         assert tracker.is_complete
 
 
-def test_all_that_came_is_in_the_file_a_quarter_second_later(
+def test_messages_are_in_the_file_within_a_quarter_second(
     tmp_path: Path, limit: Callable[[int], None]
 ) -> None:
     recorder, bus = at_work(tmp_path)
@@ -208,7 +208,7 @@ def test_a_disk_that_stays_full_leaves_what_was_written_readable(
     assert len(part.items) > 10
 
 
-def test_a_disk_that_fills_up_is_told_in_time(
+def test_filling_disk_is_announced_in_time(
     tmp_path: Path, limit: Callable[[int], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "free_bytes", lambda _: 1_000_000)
@@ -240,7 +240,7 @@ def test_a_disk_that_does_not_sync_stops_the_table(
     assert list_recorded(tmp_path) == list_expected()
 
 
-def test_what_another_run_says_is_not_recorded(
+def test_messages_of_another_run_are_not_recorded(
     tmp_path: Path, limit: Callable[[int], None]
 ) -> None:
     recorder, bus = at_work(tmp_path)
@@ -261,7 +261,7 @@ def test_what_another_run_says_is_not_recorded(
     assert lost.text == "recorder: 4 messages missed, 0 dropped"
 
 
-def test_of_samples_that_no_log_can_hold_nothing_is_recorded(
+def test_impossible_sample_index_is_left_out_and_counted(
     tmp_path: Path, limit: Callable[[int], None]
 ) -> None:
     recorder, bus = at_work(tmp_path)
@@ -277,7 +277,7 @@ def test_of_samples_that_no_log_can_hold_nothing_is_recorded(
     assert left.text == "recorder: 1 messages left out, of impossible samples"
 
 
-def test_a_sync_that_failed_is_not_believed_to_be_mended(
+def test_failed_sync_is_not_cleared_by_a_later_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A disk tells once what it lost; the syncs after it succeed."""

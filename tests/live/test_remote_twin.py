@@ -88,7 +88,7 @@ def measured(number: int) -> Block:
         (Event(0, "order", "stop: by anna"), False),
     ],
 )
-def test_of_a_twin_outside_only_what_a_twin_says_is_taken(item: Item, taken: bool) -> None:
+def test_is_valid_offer_takes_only_output_of_a_twin(item: Item, taken: bool) -> None:
     name = topic_for(item)
     assert is_valid_offer(name, encode_item(item, RUN), RUN, END_SAMPLE, KINDS) == taken
     assert not is_valid_offer(name, encode_item(item, "another"), RUN, END_SAMPLE, KINDS)
@@ -118,14 +118,14 @@ def parts(source: str, reason: str = "x", number: int = 0) -> list[Fragment]:
     )
 
 
-def test_nobody_outside_speaks_under_a_name_of_the_run() -> None:
+def test_offers_under_a_name_of_the_run_are_refused() -> None:
     mine, theirs = parts("aa"), parts("bb")
     some = offers(*theirs, *mine, *theirs)
     some.run_publishers.add("bb")
     assert [some.take(END_SAMPLE) for _ in range(4)] == [[], mine, [], None]
 
 
-def test_who_was_let_in_is_let_in_further() -> None:
+def test_accepted_twin_stays_accepted() -> None:
     first, second = parts("aa"), parts("aa", number=1)
     some = offers(*first, *second)
     assert some.take(END_SAMPLE) == first
@@ -133,14 +133,14 @@ def test_who_was_let_in_is_let_in_further() -> None:
     assert some.take(END_SAMPLE) == second
 
 
-def test_a_payload_in_pieces_is_let_in_whole_or_not_at_all() -> None:
+def test_fragmented_offer_is_taken_whole_or_not_at_all() -> None:
     whole = parts("aa", "x" * 2 * FRAGMENT_BYTES)
     after = parts("aa", "y" * FRAGMENT_BYTES, number=7)
     some = offers(*whole, whole[0], whole[2], *whole[1:], *after)
     assert [some.take(END_SAMPLE) for _ in range(9)] == [[], [], whole, [], [], [], [], [], after]
 
 
-def test_beginnings_without_an_end_are_forgotten() -> None:
+def test_incomplete_offers_are_bounded() -> None:
     long = parts("aa", "x" * MAX_PAYLOAD_FRAGMENTS * FRAGMENT_BYTES)
     begun = [parts(f"{n:04x}", "x" * FRAGMENT_BYTES)[0] for n in range(2 * MAX_PARTIAL_PAYLOADS)]
     some = offers(*long, *begun)
@@ -191,7 +191,7 @@ def serving(*links: BusLink) -> Iterator[None]:
             link.close()
 
 
-def test_a_twin_outside_is_heard_inside_and_by_everybody_once(rig: Rig) -> None:
+def test_remote_twin_is_relayed_once_to_both_buses(rig: Rig) -> None:
     twin, listener = connect(rig.spec), connect(rig.spec)
     inside = open_spoke(RIG, rig.spec.endpoint, PATIENCE_S)
     topics = ("/twin/params", "/run/timing", "/run/event")
@@ -221,7 +221,7 @@ def test_a_twin_outside_is_heard_inside_and_by_everybody_once(rig: Rig) -> None:
     listener.close()
 
 
-def test_under_the_rigs_name_nobody_silences_it(rig: Rig) -> None:
+def test_forged_sequence_numbers_do_not_silence_the_rig(rig: Rig) -> None:
     """Its name stands beside every sample that it publishes."""
     inside, observer, forger = (
         open_spoke(RIG, where, PATIENCE_S)
@@ -256,7 +256,7 @@ def test_under_the_rigs_name_nobody_silences_it(rig: Rig) -> None:
         link.close()
 
 
-def test_a_twin_answers_nobody_but_the_gate(rig: Rig) -> None:
+def test_remote_twin_answers_only_the_gateway(rig: Rig) -> None:
     victim, twin = connect(rig.spec), connect(rig.spec)
     inbox = victim.subscribe((MEAS_TOPIC,), history=True, capacity=QUEUE_CAPACITY)
     sent_count = len([message for message in rig.sent if message[0] == MEAS_TOPIC])
@@ -273,9 +273,7 @@ def test_a_twin_answers_nobody_but_the_gate(rig: Rig) -> None:
     victim.close()
 
 
-def test_a_twin_that_comes_after_another_says_what_is_missing(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_second_remote_twin_publishes_a_fault(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """`attend twin` from its start to the end of the run; it reads no standard input."""
     monkeypatch.setattr(twin_process, "LINGER_S", 0.3)
     monkeypatch.setattr(twin_process, "request_realtime", lambda _: "")

@@ -79,7 +79,7 @@ def publish_replay(
 
 
 @pytest.mark.parametrize("speed", ["max", pytest.param("4", marks=pytest.mark.slow)])
-def test_what_is_heard_is_what_is_recorded(
+def test_subscriber_of_a_replay_receives_the_recording(
     log_file: Path, endpoint: str, tmp_path: Path, speed: str
 ) -> None:
     """Both streams, byte for byte, in the order of the test; rig and twin are alive."""
@@ -101,7 +101,7 @@ def test_what_is_heard_is_what_is_recorded(
 
 @pytest.mark.slow  # 5 s each
 @pytest.mark.parametrize("waits", [True, False])
-def test_who_is_slow_is_waited_for(
+def test_replay_waits_for_a_slow_subscriber(
     log_file: Path, endpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, waits: bool
 ) -> None:
     """A publisher that holds little loses nothing for one who does not listen for a second;
@@ -117,7 +117,9 @@ def test_who_is_slow_is_waited_for(
     assert Counter(listener.received) == Counter((item.topic, item.payload) for item in made)
 
 
-def test_a_bus_that_is_taken_is_refused(log_file: Path, endpoint: str, tmp_path: Path) -> None:
+def test_replay_at_a_used_endpoint_is_refused(
+    log_file: Path, endpoint: str, tmp_path: Path
+) -> None:
     hub = open_hub("simulated", endpoint)
     try:
         with raises_input_error(

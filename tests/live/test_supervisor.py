@@ -73,7 +73,7 @@ def run_supervisor(played: Played, asked: Callable[[], str | None], **children: 
     return supervisor
 
 
-def test_a_stop_is_repeated_until_the_rig_has_it() -> None:
+def test_stop_is_repeated_until_the_rig_accepts_it() -> None:
     played = Played(("rig", "recorder", "gate"), [None, None, "refused: no"])
     run_supervisor(played, lambda: "interrupted")
     assert played.orders == [("stop", "interrupted")] * 4

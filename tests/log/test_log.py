@@ -174,7 +174,7 @@ def test_a_gap_is_nan_on_the_one_axis(recording: Recording, tmp_path: Path) -> N
     assert log.time_s.size == len(meas)
 
 
-def test_a_step_that_was_decided_on_is_a_step(recording: Recording, tmp_path: Path) -> None:
+def test_added_step_is_a_step(recording: Recording, tmp_path: Path) -> None:
     """The last step as a visit: not in the plan, told by a record."""
     start = replace(recording.start, steps=recording.start.steps[:-1])
     last = recording.start.steps[-1]
@@ -186,7 +186,7 @@ def test_a_step_that_was_decided_on_is_a_step(recording: Recording, tmp_path: Pa
     assert log.step(5).step.frequency_hz == last.frequency_hz
 
 
-def test_what_is_no_log_is_refused(tmp_path: Path) -> None:
+def test_missing_log_is_refused(tmp_path: Path) -> None:
     for place in (tmp_path, tmp_path / "none.mcap"):
         with raises_input_error(where=place, remedy="run.mcap"):
             open_log(place)
@@ -230,7 +230,9 @@ def test_the_dataset_has_every_channel_with_its_unit(log: Log, recording: Record
     assert np.array_equal(u, relative_displacement(meas))
 
 
-def test_without_xarray_it_says_what_to_install(log: Log, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_to_xarray_without_xarray_names_the_extra(
+    log: Log, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "xarray", None)
     with raises_input_error(remedy='"shaketwin[notebook]"'):
         log.to_xarray()

@@ -28,7 +28,7 @@ def limit() -> Iterator[Limit]:
     resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
 
 
-def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limit) -> None:
+def test_unwritten_bytes_wait_for_room_and_are_written_once(tmp_path: Path, limit: Limit) -> None:
     file, expected = AppendOnlyFile(tmp_path / "a"), b""
     chance = random.Random(1)
     for number in range(200):
@@ -53,7 +53,7 @@ def test_what_does_not_fit_waits_and_is_written_once(tmp_path: Path, limit: Limi
 
 
 @pytest.mark.parametrize("loss", ["file deleted", "folder deleted", "folder moved"])
-def test_a_recording_that_is_taken_away_is_written_again(tmp_path: Path, loss: str) -> None:
+def test_deleted_or_moved_file_is_written_again(tmp_path: Path, loss: str) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     path = folder / "a"

@@ -82,7 +82,7 @@ def test_a_log_of_any_version_is_read_to_the_bit(version: int) -> None:
 
 
 @pytest.mark.parametrize("version", WRITTEN)
-def test_a_log_says_its_hash_since_version_2(version: int) -> None:
+def test_log_states_its_hash_since_version_2(version: int) -> None:
     path = GOLDEN / f"v{version}.mcap"
     assert verify_log(path) is (version >= 2)
     assert recover_log(path).metadata.get("content") == (content(path) if version >= 2 else None)
@@ -139,6 +139,6 @@ def test_a_newer_version_is_refused_by_its_number(
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "two", "9" * 5000, "1.0", ""])
-def test_a_version_that_is_none_is_refused(text: str) -> None:
+def test_malformed_version_is_refused(text: str) -> None:
     with raises_input_error(where="a.mcap", problem=text, allowed=f"1 to {SCHEMA_VERSION}"):
         read_schema_version(Path("a.mcap"), {"run": {"schema": text}})

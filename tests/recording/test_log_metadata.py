@@ -27,7 +27,7 @@ def record(messages: list[tuple[str, int, bytes]]) -> dict[str, str]:
     return content.to_metadata()
 
 
-def test_the_hash_is_the_one_of_the_page() -> None:
+def test_content_hash_is_that_of_log_md() -> None:
     text = b"/rig/meas 0 3\none/rig/meas 10 3\ntwo/run/event 10 0\n"
     assert record(MESSAGES) == {
         "sha256": sha256(text).hexdigest(), "messages": "3", "/rig/meas": "2", "/run/event": "1",
@@ -48,7 +48,7 @@ def test_the_hash_depends_on_order_time_topic_and_bytes() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(build_attachments(START)))
-def test_an_attachment_that_is_not_what_was_written_is_named(name: str) -> None:
+def test_altered_attachment_is_named(name: str) -> None:
     texts = build_attachments(START)
     metadata = {"attachments": hash_attachments(texts)}
     assert find_altered_attachments(metadata, texts) == []

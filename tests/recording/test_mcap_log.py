@@ -39,7 +39,7 @@ def log(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-def test_what_was_written_is_read_back_to_the_bit(log: Path) -> None:
+def test_log_is_read_back_to_the_bit(log: Path) -> None:
     recording = read_recording(log)
     assert recording.is_intact
     assert (recording.run, recording.start) == (START.run, START)
@@ -190,7 +190,7 @@ def test_a_damaged_byte_is_noticed_or_does_no_harm(intact: Path, data: st.DataOb
     assert hides_nothing(flip_bits(intact, place, data.draw(st.integers(1, 255))))
 
 
-def test_what_is_no_log_of_ours_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_foreign_file_is_refused_with_the_reason(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with raises_input_error(where=path, problem=os.strerror(errno.ENOENT)):
         read_recording(path)

@@ -89,7 +89,9 @@ def test_parts_without_a_start_are_kept_and_not_merged(
 
 
 @pytest.mark.parametrize("run_bytes", [1, 500, 20_000])
-def test_what_is_sorted_in_pieces_is_the_same(tmp_path: Path, log: Path, run_bytes: int) -> None:
+def test_merge_in_sorted_runs_equals_merge_in_memory(
+    tmp_path: Path, log: Path, run_bytes: int
+) -> None:
     items = run()
     shuffled = random.Random(2).sample(items[1:], len(items) - 1)
     write(tmp_path / "a.mcap", [items[0], *shuffled[:60]])

@@ -65,7 +65,7 @@ def test_parts_of_killed_recorders_become_one_whole_log(run: Path, killed: tuple
     assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
-def test_a_whole_that_is_not_what_was_written_leaves_the_parts(
+def test_merge_that_fails_verification_keeps_the_parts(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = part(run, 1, 0, 61, killed=True)
@@ -105,7 +105,7 @@ def test_parts_of_a_run_that_goes_on_are_not_touched(run: Path) -> None:
     merge_run_parts(run)
 
 
-def test_a_run_without_a_recording_says_so(run: Path) -> None:
+def test_run_without_parts_is_refused(run: Path) -> None:
     with raises_input_error(where=run):
         merge_run_parts(run)
 
@@ -159,7 +159,7 @@ def test_a_death_between_the_log_and_its_parts_loses_nothing(run: Path) -> None:
     assert [path.name for path in run.iterdir()] == ["run.mcap"]
 
 
-def test_what_is_damaged_is_safe_before_the_log_has_its_name(
+def test_damaged_parts_are_copied_before_the_log_is_renamed(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Whoever finds the log afterwards takes the parts away."""

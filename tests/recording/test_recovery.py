@@ -102,7 +102,7 @@ Accident = Callable[[bytes, int, int], bytes]
     "accident",
     [flip_bit, zero_out, cut_out, stuff_garbage, stretch_length, endless, change_opcode, missing],
 )
-def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_path: Path) -> None:
+def test_damage_costs_one_chunk(accident: Accident, content: bytes, tmp_path: Path) -> None:
     places = chunks(content)
     assert len(places) > 10
     for number in (0, len(places) // 2, len(places) - 1):
@@ -117,7 +117,7 @@ def test_an_accident_costs_one_chunk(accident: Accident, content: bytes, tmp_pat
 
 
 @pytest.mark.parametrize("further_records", [0, 1])
-def test_no_coincidence_of_lengths_costs_the_next_chunk(
+def test_chunk_after_damage_is_kept_for_any_length_lost(
     further_records: int, tmp_path: Path
 ) -> None:
     """What is lost of a chunk is as long as what follows: its declared end is a record's again."""
@@ -191,9 +191,7 @@ def test_several_accidents_cost_several_chunks(content: bytes, tmp_path: Path) -
     assert recover_payloads(tmp_path / "bad.mcap", bad) == expected
 
 
-def test_a_killed_recorder_without_its_first_chunk_has_not_written_for_nothing(
-    content: bytes, tmp_path: Path
-) -> None:
+def test_unfinished_log_without_its_first_chunk_is_read(content: bytes, tmp_path: Path) -> None:
     places = chunks(content)
     path = tmp_path / "bad.mcap"
     path.write_bytes(flip_bit(content, *places[0])[: places[-1][1]])
@@ -267,7 +265,9 @@ def test_every_packing_of_the_format_is_read(packing: CompressionType, tmp_path:
 
 
 @pytest.mark.parametrize("kind", range(len(BOMBS)))
-def test_no_bomb_goes_off(kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_decompression_bombs_are_bounded(
+    kind: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("twin.recording.recovery.MIN_WORK_BYTES", COST)
     path = tmp_path / "bomb.mcap"
     path.write_bytes(bomb(kind))
@@ -297,7 +297,7 @@ def test_a_sound_file_is_read_whole_however_long_it_is(
     assert work_limit(2**50) == 2**50 * 100
 
 
-def test_what_does_not_fit_into_memory_is_refused_and_is_no_damage(
+def test_log_beyond_memory_is_refused_not_damaged(
     content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Charged is what is kept: of other topics nothing, of empty messages what they cost."""
@@ -340,7 +340,7 @@ LIES: dict[str, Item] = {
 
 
 @pytest.mark.parametrize("words", LIES)
-def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None:
+def test_invalid_records_are_left_out_and_listed_as_damage(words: str, tmp_path: Path) -> None:
     lie = LIES[words]
     items = [item for item in RUN if item is not ONE or not isinstance(lie, Block)]
     messages = [
@@ -372,7 +372,7 @@ def test_what_cannot_be_is_left_out_and_told(words: str, tmp_path: Path) -> None
         ({"steps": (Step(1, "forward", 2.0, 0.5), Step(0, "forward", 3.0, 0.5))}, "out of order"),
     ],
 )
-def test_a_start_that_cannot_be_is_refused(
+def test_invalid_start_record_is_refused(
     changed: dict[str, Any], words: str, tmp_path: Path
 ) -> None:
     start = replace(START, **changed)
@@ -406,7 +406,7 @@ def test_only_the_topics_asked_for_are_read(content: bytes, tmp_path: Path) -> N
     assert recording.is_intact
 
 
-def test_a_wrong_checksum_of_the_whole_is_told(content: bytes, tmp_path: Path) -> None:
+def test_wrong_checksum_of_the_data_is_damage(content: bytes, tmp_path: Path) -> None:
     first, end = next((first, end) for opcode, first, end in spans(content) if opcode == 15)
     assert end - first == RECORD_HEADER.size + 4
     wrong = struct.pack("<I", zlib.crc32(b"another"))

@@ -67,7 +67,7 @@ def test_rows_leave_it_out_and_are_not_whole(log: Path, true: Block) -> None:
     )
 
 
-def test_an_export_says_so(log: Path, tmp_path: Path) -> None:
+def test_export_reports_items_of_another_run(log: Path, tmp_path: Path) -> None:
     assert not export_log(ExportOptions(log, ("csv",), tmp_path / "a.csv")).is_intact
 
 
@@ -83,7 +83,7 @@ def test_batches_leave_it_out(log: Path) -> None:
     assert mine == theirs
 
 
-def test_the_door_is_whole_where_every_topic_is(log: Path, true: Block, tmp_path: Path) -> None:
+def test_open_log_is_whole_only_if_every_topic_is(log: Path, true: Block, tmp_path: Path) -> None:
     """Also where the records alone are in order."""
     door = open_log(log)
     assert door["drive_disp_m"].tobytes() == true.values[0].tobytes()
@@ -109,7 +109,7 @@ def test_the_door_is_whole_where_every_topic_is(log: Path, true: Block, tmp_path
     ],
     ids=["rate", "channels", "label", "start", "late"],
 )
-def test_one_filter_by_the_rules_of_the_reader(odd: Block | Record) -> None:
+def test_iter_valid_items_filters_as_the_reader(odd: Block | Record) -> None:
     reasons: list[str] = []
     bad, good = encode_item(odd, START.run), encode_item(block(20), START.run)
     assert list(iter_valid_items(topic_for(odd), [bad], START, reasons)) == []
@@ -118,6 +118,6 @@ def test_one_filter_by_the_rules_of_the_reader(odd: Block | Record) -> None:
     assert "not a Block" in reasons[-1]
 
 
-def test_what_a_file_holds_is_not_what_is_read(log: Path) -> None:
+def test_foreign_messages_are_in_the_file(log: Path) -> None:
     """The foreign messages are in the file, so the tests above leave out something."""
     assert len(recover_log(log).messages) == len(read_recording(log).items) + 2

@@ -88,9 +88,7 @@ def test_the_csv_is_the_json(table: Path) -> None:
             assert float(line[name]) == row[name]
 
 
-def test_one_that_is_not_identical_is_told_by_the_exit_code(
-    logs: list[Path], tmp_path: Path
-) -> None:
+def test_differing_replay_of_several_has_its_exit_code(logs: list[Path], tmp_path: Path) -> None:
     recording = read_recording(logs[0] / "run.mcap")
     items = list(recording.items)
     last = recording.records(Comparison)[-1]
@@ -115,7 +113,7 @@ def test_one_that_is_not_identical_is_told_by_the_exit_code(
         (["g4", "still"], ["recorded"], None, {"key": "table_acc_m_s2"}),
     ],
 )
-def test_what_cannot_be_is_said_before_the_first_replay(
+def test_impossible_replays_are_refused_before_the_first(
     logs: list[Path], tmp_path: Path, logs_of: list[str], models: list[str], steps: str | None,
     fields: dict[str, str],
 ) -> None:  # fmt: skip
@@ -135,7 +133,7 @@ def test_what_cannot_be_is_said_before_the_first_replay(
         ({"speed": "2"}, "--speed 2"),
     ],
 )
-def test_what_shows_one_replay_is_refused_for_many(
+def test_options_of_one_replay_are_refused_for_several(
     logs: list[Path], tmp_path: Path, more: dict[str, str], where: str
 ) -> None:
     with raises_input_error(where=where):

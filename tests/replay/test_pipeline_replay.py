@@ -60,7 +60,7 @@ def with_values(items: Iterable[Item], old: Item, new: Item) -> list[Item]:
 
 
 @pytest.mark.parametrize("cut", [7, 20, 333, 0])
-def test_however_it_is_cut_the_result_is_the_same(
+def test_replay_does_not_depend_on_block_size(
     recording: Recording, bundle: RunConfig, tmp_path: Path, cut: int
 ) -> None:
     identity, made = again(recorded_in(recording), bundle, tmp_path / "run.mcap", cut=cut)
@@ -156,7 +156,7 @@ def test_steps_that_are_not_there_are_refused(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize("text", ["5:3", "a:b", "", "1:2:3", "-1:2"])
-def test_a_range_that_is_none_is_refused(text: str) -> None:
+def test_malformed_step_range_is_refused(text: str) -> None:
     with raises_input_error(where=f"--steps {text}", allowed="FIRST:LAST"):
         parse_step_range(text)
     assert parse_step_range("4") == (4, 4)
@@ -210,7 +210,7 @@ def test_parameters_that_changed_are_changed_again(
     assert index - 20 < identity.first_difference < index + 250
 
 
-def test_steps_after_a_change_say_what_holds(
+def test_steps_after_a_change_start_with_its_parameters(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     """The parameters that changed before the first sample stand at it."""
@@ -282,7 +282,7 @@ def test_another_version_alone_makes_no_difference(
     assert set(report["versions_differing"]) == {"numpy"}
 
 
-def test_another_kernel_is_told_with_versions_and_size(
+def test_differing_kernel_is_reported_with_versions_and_size(
     log_file: Path,
     tmp_path: Path,
     report: dict[str, Any],

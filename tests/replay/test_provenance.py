@@ -59,7 +59,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     return kept
 
 
-def test_it_states_what_made_it_and_of_what(
+def test_replay_states_versions_and_source(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     start = replace(
@@ -119,7 +119,7 @@ def test_some_steps_replayed_are_not_said_to_differ(
 
 
 @pytest.mark.parametrize("ended", [True, False])
-def test_where_none_was_recorded_nothing_differs(
+def test_replay_without_recorded_comparisons_is_not_different(
     recording: Recording,
     tmp_path: Path,
     report: dict[str, Any],
@@ -137,7 +137,7 @@ def test_where_none_was_recorded_nothing_differs(
 
 
 @pytest.mark.parametrize("is_faulted", [True, False])
-def test_what_died_with_the_twin_is_no_difference(
+def test_comparisons_lost_with_the_twin_are_no_difference(
     recording: Recording, tmp_path: Path, report: dict[str, Any], is_faulted: bool
 ) -> None:
     """Twin and recorder, or twin and supervisor, killed at once: its last results are lost."""
@@ -159,7 +159,7 @@ def test_what_died_with_the_twin_is_no_difference(
 
 
 @pytest.mark.parametrize("marked", ["fault", "timing"])
-def test_what_a_living_twin_made_is_missed(
+def test_comparisons_of_a_living_twin_are_missed(
     recording: Recording, tmp_path: Path, report: dict[str, Any], marked: str
 ) -> None:
     """Comparisons long before its death, or while it reported latencies, are not excused."""
@@ -180,7 +180,7 @@ def test_what_a_living_twin_made_is_missed(
     assert report["unrecorded"] > 300
 
 
-def test_one_that_differs_is_told_alone_and_among_many(
+def test_differing_replay_has_its_exit_code_alone_and_in_a_table(
     recording: Recording, tmp_path: Path, report: dict[str, Any]
 ) -> None:
     """A recording that ended and lacks a comparison that the replay makes."""

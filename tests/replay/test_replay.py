@@ -218,7 +218,7 @@ def test_missing_samples_are_replayed_as_they_were(
     assert first.missing_samples == second.missing_samples == 100
 
 
-def test_what_the_rig_said_is_kept_and_hints_are_said_anew(
+def test_rig_events_are_kept_and_jump_events_recomputed(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     note = Event(2500, "note", "the operator coughed")

@@ -84,7 +84,7 @@ def collect_keys(session: Any, *keys: str) -> list[str]:
 
 
 @pytest.mark.parametrize("who", KNOWN)
-def test_everybody_known_hears_every_topic(hub: BusLink, person: Any, who: str) -> None:
+def test_every_listed_person_receives_every_topic(hub: BusLink, person: Any, who: str) -> None:
     session = person(who)
     got = collect_keys(
         session, *(key_expression(RIG, topic).removeprefix(f"{ROOT}/") for topic in TOPIC_TYPES)
@@ -96,7 +96,7 @@ def test_everybody_known_hears_every_topic(hub: BusLink, person: Any, who: str) 
 
 
 @pytest.mark.parametrize("who", [*KNOWN, "gone"])
-def test_nobody_hears_commands_or_what_is_wider(hub: BusLink, person: Any, who: str) -> None:
+def test_no_person_receives_commands_or_wider_keys(hub: BusLink, person: Any, who: str) -> None:
     session = person(who)
     got = collect_keys(session, "**", "*/rig/meas", "cmd/**", "state/**", "../**")
     for where in ("stream/rig/meas", "event/run/start", "cmd/stop/anna", "state/held"):
@@ -105,7 +105,7 @@ def test_nobody_hears_commands_or_what_is_wider(hub: BusLink, person: Any, who: 
     assert got == []
 
 
-def test_who_is_not_in_the_list_hears_nothing(hub: BusLink, person: Any) -> None:
+def test_unlisted_person_receives_nothing(hub: BusLink, person: Any) -> None:
     asked: list[str] = []
     rig = hub._session.declare_queryable(f"{ROOT}/**", note_keys(asked))
     session = person("gone")
@@ -119,7 +119,7 @@ def test_who_is_not_in_the_list_hears_nothing(hub: BusLink, person: Any) -> None
     assert set(asked) == {f"{ROOT}/state/role/none"}
 
 
-def test_a_twin_elsewhere_is_heard_without_loss(
+def test_remote_twin_is_received_without_loss(
     hub: BusLink, lab: Path, endpoint: str, closing: ExitStack
 ) -> None:
     """What it published before anybody asked comes too: the hub may ask for what it holds."""
@@ -154,7 +154,7 @@ def test_only_a_twin_publishes_and_only_what_a_twin_computes(
 
 
 @pytest.mark.parametrize("who", KNOWN)
-def test_a_command_bears_the_name_of_who_gives_it(person: Any, who: str) -> None:
+def test_command_carries_the_authenticated_sender(person: Any, who: str) -> None:
     session = person(who)
     (answer,) = answers(session, f"cmd/stop/{who}")
     assert (b"need the role command" in answer) == (PEOPLE[who] != "command")
@@ -166,7 +166,7 @@ def test_a_command_bears_the_name_of_who_gives_it(person: Any, who: str) -> None
 
 
 @pytest.mark.parametrize("who", KNOWN)
-def test_everybody_known_asks_for_state_and_configuration(person: Any, who: str) -> None:
+def test_every_listed_person_queries_state_and_configuration(person: Any, who: str) -> None:
     session = person(who)
     assert answers(session, "state/status") == [b"state/status"]
     assert answers(session, "config/run") == [b"config/run"]
@@ -196,7 +196,7 @@ def test_nobody_answers_or_listens_in_the_rigs_place(hub: BusLink, person: Any, 
 
 
 @pytest.mark.parametrize("who", [*KNOWN, "gone"])
-def test_nobody_is_there_under_anothers_name(hub: BusLink, person: Any, who: str) -> None:
+def test_no_person_declares_another_name_alive(hub: BusLink, person: Any, who: str) -> None:
     session = person(who)
     false = (
         "run.twin",
@@ -218,7 +218,7 @@ def test_nobody_is_there_under_anothers_name(hub: BusLink, person: Any, who: str
     assert kept
 
 
-def test_our_own_end_says_who_is_not_in_the_list(lab: Path) -> None:
+def test_open_spoke_reports_a_missing_role(lab: Path) -> None:
     """By a hub that drops what comes too fast, as the gate's does."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     with door(endpoint, extra_settings=PUBLIC_HUB_SETTINGS, keys=read_credentials(lab)):

@@ -27,7 +27,7 @@ def lab(made_lab: Path, tmp_path: Path) -> Path:
     return shutil.copytree(made_lab, tmp_path / "lab")
 
 
-def test_a_folder_in_order_says_whose_it_is(made_lab: Path) -> None:
+def test_read_credentials_returns_the_name(made_lab: Path) -> None:
     keys = read_credentials(own(made_lab, "anna"))
     assert (keys.name, keys.people) == ("anna", None)
     rig = read_credentials(made_lab)
@@ -149,7 +149,7 @@ def test_a_wrong_access_list_names_the_fault(
         read_credentials(lab)
 
 
-def test_a_role_is_looked_up_anew_and_nobody_has_one_in_a_broken_list(lab: Path) -> None:
+def test_role_is_read_again_and_none_in_a_broken_list(lab: Path) -> None:
     keys = read_credentials(lab)
     assert [keys.role_of(who) for who in ("anna", "bob", "gone", "")] == [
         *("command", "observe"),
@@ -171,7 +171,7 @@ def test_a_persons_keys_cannot_open_a_rig(made_lab: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a" * 65, "A", "a.b", "-a", "_a", "a/b", "a b", "rig", "é"])
-def test_a_name_that_could_be_taken_for_something_else_is_refused(name: str) -> None:
+def test_ambiguous_or_reserved_name_is_refused(name: str) -> None:
     with pytest.raises(InputError) as error:
         check_name(name)
     assert error.value.value == name

@@ -74,7 +74,7 @@ def behind(between: tuple[BusLink, str], lab: Path) -> Iterator[Any]:
         yield come
 
 
-def test_behind_a_router_everybody_is_who_they_are(behind: Any) -> None:
+def test_names_are_authenticated_behind_a_router(behind: Any) -> None:
     anna, bob, gone = behind("anna"), behind("bob"), behind("gone")
     assert answers(anna, "state/role/anna") == [b"command"]
     assert answers(anna, "cmd/stop/anna") == [b"refused: this is run run"]
@@ -110,7 +110,7 @@ def test_behind_a_router_nobody_publishes_in_the_rigs_name(
     assert answers(anna, "state/status") == [b"state/status"]
 
 
-def test_our_own_end_comes_in_by_a_router(
+def test_open_spoke_connects_through_a_router(
     between: tuple[BusLink, str], behind: Any, lab: Path
 ) -> None:
     behind("anna")
@@ -130,9 +130,7 @@ def test_a_router_has_that_role_and_listens_with_keys(lab: Path) -> None:
         print_router_settings(lab, "relay", "tcp/0.0.0.0:7447", RIG)
 
 
-def test_what_is_printed_names_no_place_on_this_machine(
-    lab: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_printed_settings_name_no_local_path(lab: Path, capsys: pytest.CaptureFixture[str]) -> None:
     capsys.readouterr()
     print_router_settings(lab, "relay", "tls/0.0.0.0:7447", RIG)
     printed = capsys.readouterr().out

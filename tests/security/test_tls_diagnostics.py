@@ -217,7 +217,7 @@ REFUSED: dict[str, Case] = {
 
 
 @pytest.mark.parametrize("what", REFUSED)
-def test_a_refusal_says_which_it_is_and_what_to_do(what: str, doors: Doors) -> None:
+def test_refusal_states_problem_and_remedy(what: str, doors: Doors) -> None:
     where, whose, (problem, remedy) = REFUSED[what]
     endpoint = where(doors)
     with pytest.raises(InputError) as refusal:
@@ -229,12 +229,12 @@ def test_a_refusal_says_which_it_is_and_what_to_do(what: str, doors: Doors) -> N
 
 
 @pytest.mark.parametrize("who", ["bob", "rec", "tina"])
-def test_an_order_without_the_role_is_refused_by_name_and_role(doors: Doors, who: str) -> None:
+def test_command_without_the_role_is_refused_by_name(doors: Doors, who: str) -> None:
     with raises_input_error(problem=who):
         send_command("stop", "", doors.keyed, RIG, doors.keys(who))
 
 
-def test_an_order_with_the_role_is_obeyed(doors: Doors) -> None:
+def test_command_with_the_role_is_accepted(doors: Doors) -> None:
     assert "stop accepted" in send_command("stop", "", doors.keyed, RIG, doors.keys("anna"))
 
 
@@ -262,7 +262,7 @@ def test_a_rig_with_keys_listens_on_every_interface(doors: Doors) -> None:
         link.close()
 
 
-def test_a_rig_that_is_full_says_so(doors: Doors) -> None:
+def test_full_rig_reports_too_many_sessions(doors: Doors) -> None:
     endpoint = f"tls/{HERE}:{free_port()}"
     settings: ZenohSettings = {"transport": {"unicast": {"max_sessions": 1}}}
     with door(endpoint, extra_settings=settings, keys=read_credentials(doors.lab)):
@@ -272,7 +272,7 @@ def test_a_rig_that_is_full_says_so(doors: Doors) -> None:
         first.close()
 
 
-def test_an_address_that_zenoh_takes_for_no_name_is_said(doors: Doors) -> None:
+def test_ipv6_address_over_tls_is_reported(doors: Doors) -> None:
     try:
         socket.create_server(("::1", 0), family=socket.AF_INET6).close()
     except OSError as error:
@@ -287,7 +287,7 @@ def test_an_address_that_zenoh_takes_for_no_name_is_said(doors: Doors) -> None:
 
 @pytest.mark.parametrize("says", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n", None])
 @pytest.mark.parametrize("with_keys", [True, False])
-def test_whatever_else_listens_there_is_told_apart_in_time(
+def test_other_servers_are_distinguished_in_time(
     doors: Doors, says: bytes | None, with_keys: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One that closes, one that speaks otherwise, one that is silent."""

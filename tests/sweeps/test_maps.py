@@ -271,7 +271,7 @@ def test_a_study_that_asks_for_nothing_possible_is_refused(
         "values = [0.0, 2.0]\nscale = 'log'", "start = 0.0\nstop = 1.0\ncount = 1",
     ],
 )  # fmt: skip
-def test_a_range_that_is_none_is_refused(values: str) -> None:
+def test_malformed_step_range_is_refused(values: str) -> None:
     with pytest.raises(InputError):
         parse_toml(f'{HEAD}outcomes = ["peaks"]\n{GAP}{values}\n', StudyConfig, "study")
 

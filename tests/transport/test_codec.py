@@ -110,7 +110,7 @@ def test_every_record_comes_back_to_the_bit(kind: type) -> None:
     law()
 
 
-def test_what_is_missing_is_not_what_is_empty() -> None:
+def test_missing_and_empty_fields_differ() -> None:
     none = CycleExtremes(20, 1, 0, 3, 100, None, None)
     zeros = Extremes(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, (), ())
     empty = CycleExtremes(20, 1, 0, 3, 100, zeros, None)
@@ -275,7 +275,7 @@ def test_the_schema_in_a_log_is_that_of_its_messages(kind: type) -> None:
     assert codec.MESSAGE_NAMES[kind] in {message.name for message in file.message_type}
 
 
-def test_the_generated_module_is_what_the_proto_file_says(tmp_path: Path) -> None:
+def test_generated_module_matches_the_proto_file(tmp_path: Path) -> None:
     pytest.importorskip("grpc_tools", reason='needs the extra "proto" to read shaketwin.proto')
     out = tmp_path / "descriptors"
     command = [sys.executable, "-m", "grpc_tools.protoc", f"-I{STREAM}"]

@@ -71,7 +71,7 @@ def test_any_protobuf_reader_finds_the_numbers() -> None:
     assert message.labels == np.array([2, -1, 3, 0, 4, 1], "<i4").tobytes()
 
 
-def test_rows_that_are_no_neighbours_in_memory() -> None:
+def test_block_with_strided_rows_comes_back() -> None:
     """A cut of a longer block, and rows that stand in a matrix of columns."""
     values = np.arange(40.0).reshape(10, 4).T
     labels = np.zeros(10, np.int64)

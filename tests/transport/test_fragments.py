@@ -55,7 +55,7 @@ class Asked:
         self.questions.append(question)
 
 
-def test_a_payload_that_lacks_a_piece_is_none_and_the_next_one_is_whole() -> None:
+def test_incomplete_payload_is_discarded_and_the_next_is_whole() -> None:
     parcel = PayloadAssembly()
     first, _, third = split_payload(TOPIC, SOURCE, 0, bytes(3 * FRAGMENT_BYTES))
     assert [parcel.add(first), parcel.add(third)] == [None, None]
@@ -63,7 +63,7 @@ def test_a_payload_that_lacks_a_piece_is_none_and_the_next_one_is_whole() -> Non
     assert parcel.add(after) == b"next"
 
 
-def test_an_answer_holds_no_more_than_fits_beside_what_tells_its_sizes() -> None:
+def test_reply_fits_with_the_list_of_its_sizes() -> None:
     shelf = HistoryCache()
     for number in range(3000):
         shelf.add(number, 3, b"x")
@@ -98,7 +98,7 @@ def test_an_answer_holds_no_more_than_fits_beside_what_tells_its_sizes() -> None
         b" " * 60_000 + b"[]",
     ],
 )
-def test_an_answer_that_is_none_is_ignored(stamp: bytes) -> None:
+def test_malformed_reply_is_ignored(stamp: bytes) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     inbox.handle_sample("", Bytes(stamp), Bytes(b"abc"))
     assert inbox.get(0.0) is None
@@ -126,11 +126,11 @@ def test_an_answer_that_is_none_is_ignored(stamp: bytes) -> None:
         b'{"history": true, "next": {}}' + b" " * MAX_HISTORY_QUERY_BYTES,
     ],
 )
-def test_a_question_that_is_none_is_not_understood(question: bytes) -> None:
+def test_malformed_history_query_is_rejected(question: bytes) -> None:
     assert parse_history_query(question) is None
 
 
-def test_the_question_of_an_inbox_is_understood_after_many_deaths() -> None:
+def test_history_query_of_many_publishers_is_parsed() -> None:
     link = Asked()
     inbox = ReliableSubscriber(link, tuple(TOPIC_TYPES), True, 10_000)
     for publisher in range(14):
@@ -147,7 +147,7 @@ def test_the_question_of_an_inbox_is_understood_after_many_deaths() -> None:
 
 
 @pytest.mark.parametrize("lie", [0, -1e30, -1, 2**63 - 1, 2**64, 10**400])
-def test_who_lies_about_how_far_it_has_come_lacks_no_more_than_is_held(lie: float) -> None:
+def test_false_position_of_a_subscriber_is_clamped_to_the_cache(lie: float) -> None:
     listeners = SubscriberProgress()
     shelf = HistoryCache()
     for number in range(5, 15):
@@ -162,7 +162,7 @@ def test_who_lies_about_how_far_it_has_come_lacks_no_more_than_is_held(lie: floa
     assert len(build_history_reply(shelves, question.next, True)[1]) == lacks
 
 
-def test_an_answer_about_another_topic_is_nobodys() -> None:
+def test_reply_about_another_topic_is_ignored() -> None:
     link = Asked()
     inbox = ReliableSubscriber(link, (TOPIC,), True, 10)
     header = [["/run/stop", SOURCE, 0, 1, [[3, 3]]], [TOPIC, SOURCE, 0, 1, [[3, 2]]]]
@@ -171,7 +171,7 @@ def test_an_answer_about_another_topic_is_nobodys() -> None:
     assert inbox.get(0.0) is None
 
 
-def test_a_number_that_no_answer_can_tell_is_ignored() -> None:
+def test_sequence_number_beyond_the_limit_is_ignored() -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     for number in (0, 2**64 - 1, 2**63):
         piece = Fragment(TOPIC, SOURCE, number, 3, b"x")
@@ -181,7 +181,7 @@ def test_a_number_that_no_answer_can_tell_is_ignored() -> None:
     assert (inbox.ignored, inbox.missed) == (2, 0)
 
 
-def test_of_what_is_offered_ever_new_publishers_cost_nothing() -> None:
+def test_new_publishers_of_offers_cost_no_memory() -> None:
     link = Asked()
     inbox = ReliableSubscriber(link, (TOPIC, "/run/stop"), True, 10, offered=True)
     honest = Fragment("/run/stop", SOURCE, 0, 3, b"heard")
@@ -276,7 +276,7 @@ def make_caches() -> dict[tuple[str, str], HistoryCache]:
 
 @pytest.mark.parametrize("history", [True, False])
 @pytest.mark.parametrize("room", [FRAGMENT_BYTES, 15, 0])
-def test_a_reply_holds_what_is_next_rare_topics_first(
+def test_reply_holds_the_next_fragments_rare_topics_first(
     room: int, history: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(history_cache, "FRAGMENT_BYTES", room)
@@ -299,7 +299,7 @@ def test_a_reply_holds_what_is_next_rare_topics_first(
         assert build_history_reply(caches, next_sequences, history) == (expected, bodies)
 
 
-def test_the_largest_lag_is_that_of_those_who_asked_lately(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_max_lag_counts_recent_subscribers_only(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, caches, progress = ManualClock(100.0), make_caches(), SubscriberProgress()
     monkeypatch.setattr(history_cache, "CLOCK", clock)
     assert progress.max_lag(caches) == 0
@@ -362,7 +362,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> ManualClock:
     return stepped
 
 
-def test_questions_follow_one_another_as_fast_as_they_help(clock: ManualClock) -> None:
+def test_history_queries_have_the_period_of_their_need(clock: ManualClock) -> None:
     """Each half second without a gap, each tenth with one, 3 ms after a reply that left one."""
     link = Asked()
     inbox = ReliableSubscriber(link, (TOPIC,), True, 10)
@@ -413,7 +413,7 @@ def test_the_gap_of_a_dead_publisher_is_given_up_after_ten_seconds(
 
 @pytest.mark.parametrize("history", [True, False])
 @pytest.mark.parametrize("begin", [0, 3])
-def test_a_newcomer_starts_at_the_cache_or_at_what_comes(
+def test_new_subscriber_starts_at_the_cache_or_at_the_next_fragment(
     begin: int, history: bool, clock: ManualClock
 ) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), history, 10)
@@ -425,7 +425,7 @@ def test_a_newcomer_starts_at_the_cache_or_at_what_comes(
     assert inbox.missed == 0
 
 
-def test_what_left_the_cache_is_missed(clock: ManualClock) -> None:
+def test_fragments_that_left_the_cache_are_counted_as_missed(clock: ManualClock) -> None:
     inbox = ReliableSubscriber(Asked(), (TOPIC,), True, 10)
     send(inbox, 0, 1, 9)
     assert receive(inbox) == [0, 1]
@@ -515,7 +515,7 @@ def test_every_payload_is_delivered_once_and_in_order_whatever_is_lost(
     assert not inbox.is_behind
 
 
-def test_a_question_keeps_64_letters_of_its_sender() -> None:
+def test_history_query_keeps_64_letters_of_its_sender() -> None:
     query = {"who": "x" * 100, "history": 1, "next": {TOPIC: {"00ff": 3.0}}}
     parsed = parse_history_query(json.dumps(query).encode())
     assert parsed == HistoryQuery("x" * 64, True, {TOPIC: {"00ff": 3}})

@@ -222,9 +222,7 @@ def test_spokes_hear_hub_and_each_other_without_loss(
     assert (inbox.missed, inbox.dropped, inbox.ignored) == (0, 0, 0)
 
 
-def test_a_late_joiner_gets_what_is_held_while_publishing_goes_on(
-    hub: BusLink, endpoint: str
-) -> None:
+def test_late_subscriber_gets_the_cache_during_publishing(hub: BusLink, endpoint: str) -> None:
     hub.declare((MEAS_TOPIC, "/run/start"))
     hub.publish("/run/start", number_block(7))
     for number in range(2000):
@@ -342,7 +340,7 @@ def test_a_command_that_nobody_answers_is_none_in_time(hub: BusLink, spoke: BusL
     assert commands.poll() is not None
 
 
-def test_whoever_asks_and_stalls_holds_nobody_up_who_answers(
+def test_stalled_requester_does_not_delay_the_reply(
     hub: BusLink, endpoint: str, start: Start
 ) -> None:
     hub.declare((MEAS_TOPIC,))
@@ -359,7 +357,7 @@ def test_whoever_asks_and_stalls_holds_nobody_up_who_answers(
     assert sorted(command.name for command in given) == ["hold", "resume"]
 
 
-def test_foreign_questions_and_messages_do_no_harm(hub: BusLink, spoke: BusLink) -> None:
+def test_malformed_queries_and_messages_are_ignored(hub: BusLink, spoke: BusLink) -> None:
     hub.declare((MEAS_TOPIC,))
     inbox = spoke.subscribe((MEAS_TOPIC,), history=True, capacity=10)
     time.sleep(SETTLED_S)
