@@ -13,8 +13,8 @@ from itertools import zip_longest
 
 import numpy as np
 
+from tests.laws.laboratory_laws import SLIP_DAMPER, ZENER_DAMPER
 from tests.model.independent_solution import Witness
-from tests.model.laboratory_laws import SLIP_DAMPER, ZENER_DAMPER
 from twin.dynamics.diagram import Diagram, compute_diagram, reduce_period
 from twin.dynamics.orbits import Orbit, find_orbit, motion_size
 from twin.dynamics.period_map import make_period_map
@@ -91,7 +91,7 @@ def add_effect(
         "hunt_crossley": {"ch": 0.3 * p.mass * w / size},
         "bumper_maxwell": {"kb": 0.3 * p.bumper_stiffness_r, "tau": 0.1 / w},
         "table_tilt": {"tilt": 0.1 * w * w / 9.81},
-        "zener_damper": {"stiffness": 0.3 * p.stiffness, "relaxation_time": 0.5 / w},
+        "zener_damper": {"k1": 0.3 * p.stiffness, "tau": 0.5 / w},
         "slip_damper": {"force": 0.2 * force, "yield_displacement": 0.1 * size},
     }
     name = str(random.choice(list(effects)))

@@ -199,9 +199,8 @@ def _list_shapes(
         if own.logarithmic
     ]
     if len(shapes) > 1:
-        is_resonance = any(unit == "Hz" for unit, _ in shapes)
         middle = LADDER_LENGTH // 2
-        rest = slice(middle, middle + 1) if is_resonance else slice(None, None, 2)
+        rest = slice(middle, middle + 1) if effect.has_resonance else slice(None, None, 2)
         shapes = [(unit, rungs if unit == "Hz" else rungs[rest]) for unit, rungs in shapes]
     return tuple(product(*(rungs for _, rungs in shapes)))
 

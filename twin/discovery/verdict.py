@@ -34,6 +34,7 @@ from twin.discovery.selection import (
     SelectionProblem,
     SelectionResult,
 )
+from twin.laws.library import EFFECTS, load_plugins
 
 # standard errors by which a rival set must be worse to be excluded
 MIN_SEPARATION_SIGMA = 3.5
@@ -399,18 +400,18 @@ def suggest_next_run(
     names = {name.split(".")[0] for names in (best, *alternatives) for name in names}
     if outcome == "none":
         return "no further test is needed; a sweep at another amplitude would confirm the result"
-    if names & {
-        "bouc_wen", "maxwell_damper", "coulomb_friction", "stribeck_friction", "quadratic_damping",
-        "position_damping",
-    }:  # fmt: skip
+    effects = [effect for effect in (*EFFECTS, *load_plugins()) if effect.id in names]
+    in_damper = [effect for effect in effects if effect.place == "damper"]
+    if any(effect.dissipates and not effect.has_resonance for effect in in_damper):
         return (
             "the same sweep at half and at twice the amplitude: hysteresis and friction change "
             "with amplitude, relaxation only with frequency"
         )
-    if any(name.startswith("sensor_") for name in names):
+    if any(effect.acts == "sensor" for effect in effects):
         return "a calibration of the channels named, then the same sweep"
-    if names & {"gap_offset", "gap_drift", "bumper_asymmetry"}:
+    in_bumpers = [effect for effect in effects if effect.is_in_bumpers]
+    if any(effect.changes or effect.gap_rate for effect in in_bumpers):
         return "the same sweep again with the set-up unchanged, then with another gap"
-    if names & {"bumper_hardening", "bumper_cubic", "hunt_crossley", "bumper_maxwell", "adhesion"}:
+    if in_bumpers:
         return "a sweep at twice the amplitude: deeper contact at higher speed"
     return "the same sweep at another amplitude and, where there are bumpers, another gap"

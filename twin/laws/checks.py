@@ -262,6 +262,9 @@ def _check_rates(effect: Effect, given: Points) -> None:
             remedy="write tanh(v / s) with a small speed s, or add coulomb_friction",
         )  # fmt: skip
     power = (moving - still) * given["v"]
+    if effect.break_away:
+        coefficients = effect.work_out_coefficients(USUAL_BASE, effect.typical_values)
+        power = power + coefficients["fc"] * np.abs(given["v"])
     if effect.dissipates and np.any(power < -MAX_JUMP_SHARE * np.abs(moving * given["v"])):
         raise InputError(
             "feeds energy in, though it dissipates", key="dissipates", value=True,

@@ -151,6 +151,11 @@ class Effect:
         return bool(self.pull_off)
 
     @property
+    def has_resonance(self) -> bool:
+        """Return whether it has a frequency of its own, which a fit must find."""
+        return any(parameter.unit == "Hz" for parameter in self.parameters)
+
+    @property
     def changes_with_time(self) -> bool:
         """Return whether it depends on the time since the start of the run."""
         return bool(self.gap_rate) or "t" in self.used_names

@@ -27,6 +27,7 @@ EFFECT = Effect(
         "stretch": State("m", "velocity - v"),
         "velocity": State("m/s", "-a - square * stretch - decay * (velocity - v)"),
     },
+    dissipates=True,
     parameters=(
         EffectParameter("mass", "kg", 0.0, 1e9, 0.0, 20.0, "m2, the attached mass."),
         EffectParameter(

@@ -20,6 +20,7 @@ EFFECT = Effect(
     force="force * z",
     states={"z": State("", "(v - 0.5 * (abs(v) * z * abs(z) + v * z * z)) / yield_displacement")},
     compiled={"fy": "force", "uy": "yield_displacement"},
+    dissipates=True,
     parameters=(
         EffectParameter("force", "N", 0.0, 1e9, 0.0, 150.0, "Fy, reached far from a reversal."),
         EffectParameter(

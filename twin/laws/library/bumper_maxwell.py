@@ -17,6 +17,7 @@ EFFECT = Effect(
     states={"b": State("N", "kb * v - b / tau")},
     compiled={"kb": "kb", "rate_b": "1 / tau"},
     is_linear=True,
+    dissipates=True,
     parameters=(
         EffectParameter("kb", "N/m", 0.0, 1e12, 0.0, 2e5, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),

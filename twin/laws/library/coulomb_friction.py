@@ -15,6 +15,7 @@ EFFECT = Effect(
     description=__doc__,
     term="Fc sign(u')",
     break_away="fc",
+    dissipates=True,
     parameters=(EffectParameter("fc", "N", 0.0, 1e9, 0.0, 50.0, "Friction force during slip."),),
     residual=(
         "Loss per cycle in proportion to amplitude, so equivalent damping falls as 1/amplitude; "

@@ -16,6 +16,7 @@ EFFECT = Effect(
     term="ch |u_j| u_j' in each bumper",
     force="ch * abs(d) * v",
     compiled={"ch": "ch"},
+    dissipates=True,
     parameters=(
         EffectParameter("ch", "N s/m2", 0.0, 1e14, 0.0, 5e5, "Damping per depth of compression."),
     ),

@@ -16,6 +16,7 @@ EFFECT = Effect(
     states={"f": State("N", "k1 * v - f / tau")},
     compiled={"k1": "k1", "rate_1": "1 / tau"},
     is_linear=True,
+    dissipates=True,
     parameters=(
         EffectParameter("k1", "N/m", 0.0, 1e12, 0.0, 8e3, "Stiffness that relaxes."),
         EffectParameter("tau", "s", 1e-4, 100.0, None, 0.05, "Relaxation time."),

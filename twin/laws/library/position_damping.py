@@ -12,6 +12,7 @@ EFFECT = Effect(
     description=__doc__,
     term="cu u^2 u'",
     force="cu * u * u * v",
+    dissipates=True,
     parameters=(EffectParameter("cu", "N s/m3", 0.0, 1e14, 0.0, 3e6, "Damping per u squared."),),
     residual=(
         "Equivalent damping grows as amplitude^2, the same at every frequency; third harmonic in "

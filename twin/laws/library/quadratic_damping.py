@@ -13,6 +13,7 @@ EFFECT = Effect(
     term="c2 u' |u'| in the damper",
     force="c2 * v * v * sign(v)",
     compiled={"c2": "c2"},
+    dissipates=True,
     parameters=(
         EffectParameter("c2", "N s2/m2", 0.0, 1e12, 0.0, 2e3, "Coefficient of speed squared."),
     ),

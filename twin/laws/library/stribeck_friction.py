@@ -19,6 +19,7 @@ EFFECT = Effect(
     constants={"fall": "fc * (ratio - 1)"},
     force="fall * expm1(-((v / speed) ** 2)) * sign(v)",
     break_away="fc * ratio",
+    dissipates=True,
     parameters=(
         EffectParameter("fc", "N", 0.0, 1e9, 0.0, 40.0, "Friction force during fast slip."),
         EffectParameter("ratio", "", 1.0, 30.0, None, 3.0, "Break-away force over Fc."),
