@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 
 from table_io.formats.table import TOML_TEXTS, ColumnKey, ForeignTable, extract_column
-from table_io.formats.words import LABEL_FIELDS, find_label
+from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, find_label
 
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
@@ -56,6 +56,7 @@ def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
             table.add_array(f"{name}/{field}", item.shape, kind, (name, field), group=name)
     else:
         unit = next((_to_text(item.attrs[key]) for key in UNIT_ATTRIBUTES if key in item.attrs), "")
+        unit = unit or next(iter(_read_field(item, UNIT_FIELDS)), "")
         table.add_array(
             name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0]
         )
@@ -67,17 +68,32 @@ def _add_references(table: ForeignTable, name: str, item: Any) -> None:
         table.dropped[name] = f"{item.size} cells"
         return
     file, parent = item.file, name.rpartition("/")[0]
-    fields: list[Any] = [item.parent[field] for field in LABEL_FIELDS if field in item.parent]
-    labels = [field[()].reshape(-1) for field in fields if field.shape == item.shape]
+    labels = _read_field(item, LABEL_FIELDS)
+    units = _read_field(item, UNIT_FIELDS)
     for k, reference in enumerate(item[()].reshape(-1)):
         cell: Any = file[reference] if reference else None
         if getattr(cell, "dtype", None) is None or cell.dtype.kind not in "fiub":
             continue
         if _to_text(cell.attrs.get("MATLAB_class", "")) == "char":
             continue
-        label = find_label({"Name": _read_text(file[labels[0][k]])}) if labels else ""
+        label = find_label({"Name": labels[k]}) if labels else ""
         inner = f"{parent}/{label}" if label else f"{name}/{k + 1}"
-        table.add_array(inner, cell.shape, cell.dtype.kind, (cell.name, ""), group=parent)
+        unit = units[k] if units else ""
+        table.add_array(inner, cell.shape, cell.dtype.kind, (cell.name, ""), unit, parent)
+
+
+def _read_field(item: Any, fields: tuple[str, ...]) -> list[str]:
+    """Return the texts that stand next to the data of a structure, one for each of its elements."""
+    for name in fields:
+        field: Any = item.parent.get(name) if item.name.rpartition("/")[2] != name else None
+        if not isinstance(field, h5py.Dataset):
+            continue
+        if _to_text(field.attrs.get("MATLAB_class", "")) == "char":
+            return [_read_text(field)]
+        if h5py.check_ref_dtype(field.dtype) is h5py.Reference and field.shape == item.shape:
+            cells = [item.file[reference] for reference in field[()].reshape(-1)]
+            return [_read_text(cell) if cell.dtype.kind == "u" else "" for cell in cells]
+    return []
 
 
 def _chunk_bytes(item: Any) -> int:

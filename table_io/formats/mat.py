@@ -24,7 +24,7 @@ from table_io.formats.table import (
     check_expansion,
     extract_column,
 )
-from table_io.formats.words import add_fact, find_fact, find_label
+from table_io.formats.words import UNIT_FIELDS, add_fact, find_fact, find_label
 
 HEADER_BYTES = 128
 HDF5_MAGIC = b"\x89HDF"
@@ -33,7 +33,6 @@ MAX_DEPTH = 8
 MAX_ELEMENTS = 1000  # of a structure array
 NUMPY_KINDS = {"double": "f", "single": "f", "logical": "b", "char": "U", "cell": "O"}
 INTEGER_CLASSES = tuple(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))
-UNIT_FIELDS = ("Unit", "unit", "units")
 DATA_FIELDS = ("Data", "data", "values", "Values")  # their name is left out if the element has one
 CLOCK_FIELDS = ("X", "X/Data", "time")  # of a structure: times of all in it
 

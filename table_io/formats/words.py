@@ -40,6 +40,7 @@ QUANTITY_WORDS = {
 }  # fmt: skip
 QUANTITY_UNITS = {"m": "displacement", "m/s2": "acceleration", "N": "force", "m/s": "velocity"}
 LABEL_FIELDS = ("Name", "name", "label", "Label", "title")  # of an element of a structure array
+UNIT_FIELDS = ("Unit", "unit", "units")  # next to its data
 MIN_PREFIX_LETTERS = 4  # "accelero" is an accelerometer
 
 

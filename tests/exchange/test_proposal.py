@@ -133,6 +133,7 @@ def test_propose_map_names_what_is_left_out_and_why() -> None:
     table = ForeignTable(Path("a.csv"), "a table", held, {"state": "text, such as 'OK'"})
     expected = ("load (N) (1990 rows, the others 2000)", "state (text, such as 'OK')")
     assert propose_map(table).dropped == expected
+    assert any("'load (N)' has 1990 rows" in text for text in propose_map(table).questions)
     rated = {name: replace(column, rate_hz=200.0) for name, column in held.items() if name != "t"}
     assert [item.channel for item in propose_map(replace(table, columns=rated)).columns] == [
         "damper_force_n", "rel_disp_m",

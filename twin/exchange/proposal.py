@@ -58,6 +58,7 @@ CHANNELS_OF = {
     "force": ("damper_force_n", *RIGHT_CELLS, *LEFT_CELLS),
 }
 FACT_KEYS = ("rate_hz", "mass_kg")
+MIN_LENGTH_SHARE = 0.5  # of the other columns, from which a column is one of their recording
 OPEN_UNIT = "?"  # in a saved map: refused until a person replaces it
 
 
@@ -164,6 +165,14 @@ def propose_map(
     rate_hz = None if has_time else table.facts.get("rate_hz")
     if not has_time and rate_hz is None:
         questions.append("no times and no sampling rate in the file: state --rate HZ")
+    size = table.columns[names[0]].size if names else 0
+    for name, column in table.columns.items():
+        is_channel = find_quantity(name, column.unit) in CHANNELS_OF
+        if is_channel and size != column.size > MIN_LENGTH_SHARE * size and name not in names:
+            questions.append(
+                f"column {name!r} has {column.size} rows, others {size}, and no rate tells which "
+                "are the same: leave it out in a map, or import it alone"
+            )
     if not chosen:
         questions.append("no column is known by its name or unit: state the columns in a map")
     clocks = {info.clock for info in infos}

@@ -224,11 +224,18 @@ def structure_arrays(path: Path) -> None:
 
 
 def cell_array(path: Path) -> None:
+    """A cell array, and a structure array, as MATLAB writes them in v7.3: by references."""
     with h5py.File(path, "w") as file:
         for name, values in (("a", TIME), ("b", DISP), ("c", FORCE)):
             file[f"#refs#/{name}"] = values[None]
-        references = [[file[f"#refs#/{name}"].ref] for name in "abc"]
-        file.create_dataset("run/data", data=references, dtype=h5py.ref_dtype)
+        for name, text in (("d", "Model/Weg"), ("e", "Kraft"), ("f", "mm"), ("g", "N")):
+            cell = file.create_dataset(f"#refs#/{name}", data=np.array([[*map(ord, text)]], "u2").T)
+            cell.attrs["MATLAB_class"] = np.bytes_("char")
+        for name, cells in (
+            ("run/data", "abc"), ("run/Y/Data", "bc"), ("run/Y/Name", "de"), ("run/Y/Unit", "fg"),
+        ):  # fmt: skip
+            references = [[file[f"#refs#/{cell}"].ref] for cell in cells]
+            file.create_dataset(name, data=references, dtype=h5py.ref_dtype)
 
 
 def test_elements_of_structure_and_cell_arrays_are_columns_by_their_labels(tmp_path: Path) -> None:
@@ -244,8 +251,11 @@ def test_elements_of_structure_and_cell_arrays_are_columns_by_their_labels(tmp_p
     assert table.read_column("scope/signals/u [m/s]").tobytes() == DISP.tobytes()
     cell_array(tmp_path / "b.mat")
     cells = read_table(tmp_path / "b.mat")
-    assert [*cells.columns] == ["data/1", "data/2", "data/3"]
-    assert cells.read_column("data/2").tobytes() == DISP.tobytes()
+    assert {name: column.unit for name, column in cells.columns.items()} == {
+        "run/data/1": "", "run/data/2": "", "run/data/3": "", "run/Y/Weg": "mm", "run/Y/Kraft": "N",
+    }  # fmt: skip
+    assert cells.read_column("run/data/2").tobytes() == DISP.tobytes()
+    assert cells.read_column("run/Y/Kraft").tobytes() == FORCE.tobytes()
 
 
 def test_dates_are_times_from_the_first_one(tmp_path: Path) -> None:
