@@ -97,7 +97,7 @@ def evaluate(effect, motion, states, values=None, base=USUAL_BASE):
     "effect", [e for e in FORCES if e.force and e.place == "damper"], ids=lambda effect: effect.id
 )
 def test_a_law_of_the_damper_prefers_no_direction(effect):
-    there, back = (
+    own, mirrored = (
         evaluate(
             effect,
             {"u": sign * 1.3e-3, "v": sign * 0.07, "a": sign * 0.9},
@@ -105,8 +105,8 @@ def test_a_law_of_the_damper_prefers_no_direction(effect):
         )
         for sign in (1.0, -1.0)
     )
-    assert back == (-there[0], {name: -rate for name, rate in there[1].items()})
-    assert there[0] != 0.0
+    assert mirrored == (-own[0], {name: -rate for name, rate in own[1].items()})
+    assert own[0] != 0.0
 
 
 @pytest.mark.parametrize("effect", [*COMPILED, *ADDED], ids=lambda effect: effect.id)
