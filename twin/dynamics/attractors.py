@@ -11,20 +11,15 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cholesky, solve_discrete_lyapunov
 
-from table_io.block import Bool2D, Float1D, Float2D, Int1D
-from twin.dynamics.stroboscopic import StroboscopicMap, displace, select_free
-from twin.dynamics.stroboscopic_kernel import (
-    UNDECIDED,
-    CaptureRegions,
-    capturing_region,
-)
-from twin.model.contact_regime import CONTACT_R, U_L, U_R, U, V
+from table_io.block import Bool1D, Bool2D, Float1D, Float2D, Int1D
+from twin.dynamics.capture import UNDECIDED, CaptureRegions, capturing_region
+from twin.dynamics.orbits import find_attracting_orbit
+from twin.dynamics.period_map import PeriodMap
+from twin.model.contact_regime import CONTACT_R, U, V
 from twin.model.stepped_sine import EXTREME_NAMES
 
-Bool1D = npt.NDArray[np.bool_]
 AttractorKind = Literal["periodic", "chaotic", "quasi-periodic"]
 
 MAX_PERIOD = 64  # cycles: a longer period counts as not periodic
@@ -39,9 +34,6 @@ UNSETTLED = -2  # label of a start that has been given up
 RECURRENCE_TOL = 1e-3  # of the motion's size: a point that returns so near is tried as periodic
 RECORD_RATIO = 0.5  # by which a longer recurrence must be nearer to count
 SAME_POINT_TOL = 1e-6  # of the motion's size: two orbits with points this near are one
-NEWTON_TOL = 1e-9  # of the motion's size; the last step has reduced it further
-MAX_NEWTON_STEPS = 20
-MAX_NEWTON_STEP = 0.1  # of the motion's size
 DIRECTION_COUNT = 32  # points at which the boundary of an ellipsoid is tested
 LINEAR_SLACK, ALLOWED_SLACK = 0.8, 0.4  # share of 1 - |multiplier| by which
 MAX_RADIUS = 2.0  # of an ellipsoid, in sizes of the motion
@@ -72,18 +64,13 @@ class LyapunovExponent:
         return self.value < -MIN_EXPONENT_SIGMA * self.standard_error
 
 
-def estimate_exponent(
-    stroboscopic: StroboscopicMap, state: Float1D, cycles: int
-) -> LyapunovExponent:
-    """Estimate the largest Lyapunov exponent from a settled state, which is not modified.
+def estimate_exponent(period_map: PeriodMap, x: Float1D, cycles: int) -> LyapunovExponent:
+    """Estimate the largest Lyapunov exponent from settled coordinates.
 
     Standard error from the means of `BATCH_COUNT` batches, which allows for the correlation of
     consecutive cycles.
     """
-    return _mean_with_error(stroboscopic.measure_growth(state.copy(), cycles))
-
-
-def _mean_with_error(growth: Float1D) -> LyapunovExponent:
+    growth, _ = period_map.measure_growth(x, cycles)
     batches = np.array([batch.mean() for batch in np.array_split(growth, BATCH_COUNT)])
     return LyapunovExponent(
         float(growth.mean()), float(batches.std(ddof=1) / math.sqrt(BATCH_COUNT))
@@ -92,7 +79,7 @@ def _mean_with_error(growth: Float1D) -> LyapunovExponent:
 
 @dataclass(frozen=True, eq=False)
 class Attractor:
-    """An attractor: its points at phase 0 in order of visit, states (n, size).
+    """An attractor: its points at phase 0 in order of visit, coordinates (n, size).
 
     scale: size of the motion in u and v, m and m/s, (2,). extremes: `EXTREME_NAMES` of the cycles
     that begin at the last point, (cycles, 8): of a period, else of `MEASURED_CYCLES`.
@@ -177,7 +164,7 @@ def motion_scale(points: Float2D, frequency_hz: float) -> Float1D:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ellipsoid:
-    """Points |factor (z - center)| <= 1 around a point of a stable orbit: see `CaptureRegions`."""
+    """Points |factor (x - center)| <= 1 around a point of a stable orbit: see `CaptureRegions`."""
 
     center: Float1D
     factor: Float2D
@@ -186,30 +173,30 @@ class Ellipsoid:
 
 
 class AttractorSearch:
-    """Attractors of a stroboscopic map, found as undecided starts are followed to their ends."""
+    """Attractors of a period map, found as undecided starts are followed to their ends."""
 
-    def __init__(self, stroboscopic: StroboscopicMap, chaos_cycles: int = CHAOS_CYCLES) -> None:
-        self._map = stroboscopic
+    def __init__(self, period_map: PeriodMap, chaos_cycles: int = CHAOS_CYCLES) -> None:
+        self._map = period_map
         self._chaos_cycles = chaos_cycles
         self._attractors: list[Attractor] = []
         self._ellipsoids: list[tuple[Ellipsoid, ...]] = []  # of each attractor
 
-    def classify(self, states: Float2D) -> tuple[Int1D, Int1D]:
-        """Return (index of the attractor of each state or `UNDECIDED`, cycles to capture), (n,).
+    def classify(self, starts: Float2D) -> tuple[Int1D, Int1D]:
+        """Return (index of the attractor of each start or `UNDECIDED`, cycles to capture), (n,).
 
-        States (n, size) are advanced in place. An attractor that is met for the first time is
+        Starts (n, size) are advanced in place. An attractor that is met for the first time is
         added, and its mirror image is searched.
         """
-        labels = np.full(len(states), UNDECIDED)
-        cycles = np.zeros(len(states), dtype=np.int64)
+        labels = np.full(len(starts), UNDECIDED)
+        cycles = np.zeros(len(starts), dtype=np.int64)
         for attempt in range(MAX_ATTEMPTS):
             if self._attractors:
                 max_cycles = min(CAPTURE_CYCLES << attempt, MAX_CAPTURE_CYCLES)
-                self._map.capture(states, self._regions, max_cycles, labels, cycles)
+                self._map.capture(starts, self._regions, max_cycles, labels, cycles)
             undecided = np.flatnonzero(labels == UNDECIDED)
             if not undecided.size:
                 break
-            labels[undecided[0]] = self._settle(states[undecided[0]])
+            labels[undecided[0]] = self._settle(starts[undecided[0]])
         return np.maximum(labels, UNDECIDED), cycles
 
     @property
@@ -228,12 +215,10 @@ class AttractorSearch:
 
     @property
     def _regions(self) -> CaptureRegions:
-        coordinates = self._map.coordinates
         pairs = [(owner, e) for owner, group in enumerate(self._ellipsoids) for e in group]
         visitors = [(i, a.cells) for i, a in enumerate(self._attractors) if not a.is_periodic]
-        size, count = coordinates.size, CELL_COUNT
+        size, count = self._map.size, CELL_COUNT
         return CaptureRegions(
-            coordinates,
             np.array([e.center for _, e in pairs]).reshape(-1, size),
             np.array([e.factor for _, e in pairs]).reshape(-1, size, size),
             np.array([e.extent for _, e in pairs]).reshape(-1, 2),
@@ -244,53 +229,57 @@ class AttractorSearch:
             np.array([owner for owner, _ in visitors], dtype=np.int64),
         )
 
-    def _settle(self, state: Float1D) -> int:
-        """Follow a state to its attractor, adding what is new; return its index, or `UNSETTLED`."""
+    def _settle(self, x: Float1D) -> int:
+        """Follow a start to its attractor, adding what is new; return its index, or `UNSETTLED`."""
         labels = np.array([UNDECIDED])
         if self._attractors:
+            start = x[None].copy()
             self._map.capture(
-                state[None], self._regions, CAPTURE_CYCLES, labels, np.zeros(1, dtype=np.int64)
+                start, self._regions, CAPTURE_CYCLES, labels, np.zeros(1, dtype=np.int64)
             )
+            x = start[0]
         if labels[0] != UNDECIDED:
             return int(labels[0])
         total, count = 0, SETTLING_CYCLES
         while total < MAX_SETTLING_CYCLES:
-            label = self._recognize(state, self._map.advance(state, count))
+            points = self._map.record(x, count)
+            x = points[-1]
+            label = self._recognize(points)
             if label != UNDECIDED:
                 return label
             total, count = total + count, 2 * count
-        return self._settle_without_period(state)
+        return self._settle_without_period(x)
 
-    def _recognize(self, state: Float1D, points: Float2D) -> int:
-        """Return the periodic attractor that has captured a state after `points`."""
-        label = self._find_capture(state)
+    def _recognize(self, points: Float2D) -> int:
+        """Return the periodic attractor that has captured the last of points."""
+        x, scale = points[-1], motion_scale(points, self._map.frequency_hz)
+        label = self._find_capture(x)
         if label == UNDECIDED:
-            for period in find_recurrences(points, motion_scale(points, self._map.frequency_hz)):
-                orbit = find_stable_orbit(self._map, state, period)
+            for period in find_recurrences(points, scale):
+                orbit = find_stable_orbit(self._map, x, period, float(scale[0]))
                 if orbit is not None:
                     self._add(orbit)
-                    return self._find_capture(state)
+                    return self._find_capture(x)
         return label
 
-    def _find_capture(self, state: Float1D) -> int:
-        return int(capturing_region(state, self._regions)) if self._attractors else UNDECIDED
+    def _find_capture(self, x: Float1D) -> int:
+        if not self._attractors:
+            return UNDECIDED
+        contact_r, contact_l = self._map.to_state(x)[CONTACT_R : CONTACT_R + 2]
+        return int(capturing_region(x, contact_r, contact_l, self._regions))
 
-    def _settle_without_period(self, state: Float1D) -> int:
-        start = state.copy()
-        points = self._map.advance(state, self._chaos_cycles)
-        label = self._recognize(state, points)
+    def _settle_without_period(self, x: Float1D) -> int:
+        points = self._map.record(x, self._chaos_cycles)
+        label = self._recognize(points)
         if label != UNDECIDED:
             return label  # the chaos was a transient
-        exponent = estimate_exponent(self._map, start, self._chaos_cycles)
+        exponent = estimate_exponent(self._map, x, self._chaos_cycles)
         if exponent.is_negative:
             return UNSETTLED
         kind: AttractorKind = "chaotic" if exponent.is_positive else "quasi-periodic"
-        return self._add(
-            Attractor(
-                kind, points, motion_scale(points, self._map.frequency_hz),
-                self._map.measure_cycles(state, MEASURED_CYCLES), exponent,
-            )
-        )  # fmt: skip
+        scale = motion_scale(points, self._map.frequency_hz)
+        extremes = self._map.measure_periods(points[-1], MEASURED_CYCLES)
+        return self._add(Attractor(kind, points, scale, extremes, exponent))
 
     def _add(self, attractor: Attractor) -> int:
         """Add an attractor unless it is known, search its mirror image, and return its index."""
@@ -309,15 +298,6 @@ class AttractorSearch:
         return index
 
 
-def find_attractors(
-    stroboscopic: StroboscopicMap, states: Float2D, chaos_cycles: int = CHAOS_CYCLES
-) -> tuple[Attractor, ...]:
-    """Return the attractors to which states (n, size) settle, and their mirror images."""
-    search = AttractorSearch(stroboscopic, chaos_cycles)
-    search.classify(states.copy())
-    return search.attractors
-
-
 def find_recurrences(points: Float2D, scale: Float1D) -> list[int]:
     """Return after how many cycles the last of points (n, size) was near itself, ascending.
 
@@ -330,46 +310,26 @@ def find_recurrences(points: Float2D, scale: Float1D) -> list[int]:
 
 
 def find_stable_orbit(
-    stroboscopic: StroboscopicMap, state: Float1D, period: int
+    period_map: PeriodMap, x: Float1D, period: int, size_m: float
 ) -> Attractor | None:
-    """Return the periodic attractor to which Newton's method leads from a state, or None."""
-    coordinates, start = stroboscopic.coordinates, state
-    for _ in range(MAX_NEWTON_STEPS):
-        points = stroboscopic.advance(start.copy(), period)
-        end, free = points[-1], select_free(coordinates, start)
-        error = (end - start)[coordinates[free]]
-        scale = motion_scale(points, stroboscopic.frequency_hz)
-        if not np.isfinite(error).all():
-            return None
-        jacobian = stroboscopic.differentiate(start, period)[np.ix_(free, free)]
-        if (np.abs(error[:2]) < NEWTON_TOL * scale).all():
-            break
-        try:
-            step = np.linalg.solve(np.eye(free.size) - jacobian, error)
-        except np.linalg.LinAlgError:
-            return None
-        if not (np.abs(step[:2]) < MAX_NEWTON_STEP * scale).all():
-            return None  # not a recurrence of this motion
-        start = stroboscopic.adopt(
-            displace(end, coordinates[free], start[coordinates[free]] + step)
-        )
-    else:
+    """Return the periodic attractor of a motion of this size that recurs at x, or None."""
+    orbit = find_attracting_orbit(period_map, x, period, size_m)
+    if orbit is None:
         return None
-    near = np.abs(points - end)[:, [U, V]] < SAME_POINT_TOL * scale
-    shortest = int(np.flatnonzero(near.all(axis=1))[0]) + 1
-    if shortest < period:
-        return find_stable_orbit(stroboscopic, start, shortest)
-    multipliers = np.linalg.eigvals(jacobian).astype(np.complex128)
-    multipliers = multipliers[np.argsort(-np.abs(multipliers))]
-    largest = float(abs(multipliers[0]))
-    if largest >= 1:
-        return None
-    exponent = LyapunovExponent(math.log(max(largest, math.ulp(0.0))) / period, 0.0)
-    extremes = stroboscopic.measure_cycles(end, period)
-    return Attractor("periodic", points, scale, extremes, exponent, tuple(multipliers.tolist()))
+    points = period_map.record(orbit.x, orbit.periods)
+    largest = max(float(abs(orbit.multipliers[0])), math.ulp(0.0))
+    exponent = LyapunovExponent(math.log(largest) / orbit.periods, 0.0)
+    return Attractor(
+        "periodic",
+        points,
+        motion_scale(points, period_map.frequency_hz),
+        period_map.measure_periods(orbit.x, orbit.periods),
+        exponent,
+        tuple(orbit.multipliers.tolist()),
+    )
 
 
-def find_ellipsoids(stroboscopic: StroboscopicMap, orbit: Attractor) -> tuple[Ellipsoid, ...]:
+def find_ellipsoids(period_map: PeriodMap, orbit: Attractor) -> tuple[Ellipsoid, ...]:
     """Return an ellipsoid around each point of a stable orbit into which the map contracts it.
 
     In the norm of the Lyapunov equation J' P J - P = -Q of the linear map over a period, and with
@@ -378,17 +338,17 @@ def find_ellipsoids(stroboscopic: StroboscopicMap, orbit: Attractor) -> tuple[El
     smaller radii. Nothing that enters leaves: in the plane the image of a disk is what the image of
     its boundary encloses.
     """
-    return tuple(_find_ellipsoid(stroboscopic, orbit, point) for point in orbit.points)
+    return tuple(_find_ellipsoid(period_map, orbit, point) for point in orbit.points)
 
 
-def _find_ellipsoid(stroboscopic: StroboscopicMap, orbit: Attractor, point: Float1D) -> Ellipsoid:
-    period, coordinates = len(orbit.points), stroboscopic.coordinates
-    free = select_free(coordinates, point)
-    indices = coordinates[free]
-    scale = np.abs(orbit.points[:, indices]).max(axis=0)
+def _find_ellipsoid(period_map: PeriodMap, orbit: Attractor, point: Float1D) -> Ellipsoid:
+    period, (free, directions) = len(orbit.points), period_map.free_directions(point)
+    contacts = period_map.to_state(point)[CONTACT_R : CONTACT_R + 2]
+    scale = np.abs(orbit.points).max(axis=0)
     scale[: V + 1] = orbit.scale
-    scale[(indices == U_R) | (indices == U_L)] = scale[U]
-    jacobian = stroboscopic.differentiate(point, period)[np.ix_(free, free)]
+    scale[[column for column, _ in period_map.faces]] = orbit.scale[U]
+    scale = scale[free]
+    jacobian = (period_map.evaluate(point, period).jacobian @ directions)[free]
     largest = abs(orbit.multipliers[0])
     linear, allowed = 1 - LINEAR_SLACK * (1 - largest), 1 - ALLOWED_SLACK * (1 - largest)
     norm = solve_discrete_lyapunov(
@@ -396,14 +356,14 @@ def _find_ellipsoid(stroboscopic: StroboscopicMap, orbit: Attractor, point: Floa
     )
     factor = cholesky(norm)
     inverse = np.linalg.inv(factor)
-    offsets = boundary_directions(free.size) @ inverse.T
+    offsets = boundary_directions(len(free)) @ inverse.T @ directions.T
 
     def contracts(radius: float) -> bool:
         for offset in offsets:
-            start = displace(point, indices, point[indices] + radius * offset)
-            end = stroboscopic.advance(start, period)[-1]
-            distance = np.linalg.norm(factor @ (end - point)[indices])
-            if not (distance <= allowed * radius and _same_contacts(end, point)):
+            end = period_map.iterate(point + radius * offset, period)
+            distance = np.linalg.norm(factor @ (end - point)[free])
+            end_contacts = period_map.to_state(end)[CONTACT_R : CONTACT_R + 2]
+            if not (distance <= allowed * radius and (end_contacts == contacts).all()):
                 return False
         return True
 
@@ -414,14 +374,10 @@ def _find_ellipsoid(stroboscopic: StroboscopicMap, orbit: Attractor, point: Floa
             break
         radius /= 2
     radius *= 2.0 ** max(passed - 1, 0)
-    whole = np.zeros((coordinates.size, coordinates.size))
-    whole[np.ix_(free, free)] = factor / radius
+    whole = np.zeros((point.size, point.size))
+    whole[np.ix_(range(len(free)), free)] = factor / radius
     extent = radius * np.linalg.norm(inverse, axis=1)[:2]
-    return Ellipsoid(point[coordinates], whole, extent, point[CONTACT_R : CONTACT_R + 2])
-
-
-def _same_contacts(state: Float1D, other: Float1D) -> bool:
-    return bool((state[CONTACT_R : CONTACT_R + 2] == other[CONTACT_R : CONTACT_R + 2]).all())
+    return Ellipsoid(point, whole, extent, contacts)
 
 
 def boundary_directions(dimension: int) -> Float2D:

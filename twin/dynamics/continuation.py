@@ -7,7 +7,7 @@ of a branch states its reason.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -20,9 +20,15 @@ from twin.dynamics.arclength import (
     MIN_STEP,
     CurvePoint,
     NoConvergence,
+    border_sign,
     correct,
+    correct_at_limit,
+    locate_on_arc,
     next_step,
+    null_direction,
+    passes,
     solve_square,
+    unit_axis,
     weighted_length,
 )
 from twin.dynamics.bifurcations import (
@@ -36,10 +42,12 @@ from twin.dynamics.bifurcations import (
     evaluate_criterion,
 )
 from twin.dynamics.orbits import (
+    SAME_ORBIT,
     Complex1D,
     Evaluation,
     Orbit,
     OrbitProblem,
+    find_orbit,
     floquet_multipliers,
     motion_size,
 )
@@ -61,10 +69,10 @@ PROBE_DISTANCES = (1e-6, 1e-5, 1e-4)  # beyond a grazing orbit, for the Jacobian
 BEND_STEP, MAX_BEND, BEND_REACH = 1e-4, 30.0, 5e-3
 SIMULTANEOUS_TOL = 1e-8  # of the size: guards this near to zero touch in the same orbit
 SAME_GRAZING = 1e-9  # weighted distance of one grazing orbit from itself
-LOCATION_TOL = 1e-11  # weighted length within which a bifurcation is located
 SWITCH_STEP = 0.02  # weighted amplitude of the first orbit of a branch that bifurcates
 CROSSING_TOL = 1e-8  # weighted residual of the orbit equation where two branches cross
 CROSSING_STEP = 0.02  # weighted: a larger step over a crossing is repeated
+NEAR_ORBIT = 0.5  # of the size: distance of interpolated orbits that are worth refining
 MAX_SLOPE_RATIO = 1.5  # of a tangent over a chord, 1 on a straight branch and 2 on a parabola
 
 
@@ -130,14 +138,37 @@ class Branch:
                     orbits.append(orbit)
         return orbits
 
+    def contains(self, orbit: Orbit) -> bool:
+        """Return whether an orbit is one of this branch, at any of its phases."""
+        if self.points[0].orbit.periods != orbit.periods:
+            return False
+        value, scales = orbit.period_map.parameter(self.parameter), orbit.period_map.scales
+        size = max(motion_size(x, scales) for x in orbit.phases)
+        limit = SAME_ORBIT * size
+        for first, second in zip(self.points, self.points[1:], strict=False):
+            if (first.value - value) * (second.value - value) > 0:
+                continue
+            span = second.value - first.value
+            fraction = (value - first.value) / span if span else 0.0
+            chord = second.orbit.x - first.orbit.x
+            guess = first.orbit.x + fraction * chord
+            distance = orbit.distance(guess)
+            if distance > NEAR_ORBIT * size + motion_size(chord, scales):
+                continue
+            if distance < limit:
+                return True
+            refined = find_orbit(orbit.period_map, guess, orbit.periods)
+            if refined is not None and orbit.passes(refined.x, limit):
+                return True
+        return False
+
     def _interpolate(self, first: BranchPoint, second: BranchPoint, value: float) -> Orbit | None:
         fraction = (value - first.value) / (second.value - first.value)
         if fraction == 0.0:
             return None if first is not self.points[0] else first.orbit
         problem = make_problem(first.orbit, self.parameter)
         z0, z1 = (np.append(p.orbit.x, p.value) for p in (first, second))
-        axis, weights = np.zeros(z0.size), np.ones(z0.size)
-        axis[-1] = 1.0
+        axis, weights = unit_axis(z0.size, 1.0), np.ones(z0.size)
         weights[:-1] = orbit_weights(first.orbit)
         guess = z0 + fraction * (z1 - z0)
         guess[-1] = value
@@ -165,19 +196,12 @@ def split_by_stability(stable: Sequence[bool]) -> list[tuple[int, int, bool]]:
 
 def make_problem(orbit: Orbit, *names: str) -> OrbitProblem:
     """Return the equation of an orbit's continuation over these parameters."""
-    return OrbitProblem(
-        orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods, names
-    )
+    return OrbitProblem(orbit.period_map, orbit.periods, *names)
 
 
 def orbit_weights(orbit: Orbit) -> Float1D:
     """Return the weights of x, (n,), by which its largest coordinate is about 1."""
-    return 1.0 / (orbit.period_map.scales * orbit_size(orbit))
-
-
-def orbit_size(orbit: Orbit) -> float:
-    """Return the largest coordinate in m, at least 1e-12 m."""
-    return max(motion_size(orbit.x, orbit.period_map.scales), 1e-12)
+    return 1.0 / (orbit.period_map.scales * orbit.size_m)
 
 
 def continue_branch(
@@ -208,9 +232,7 @@ def continue_branch(
 
     def trace(sign: int) -> _Trace:
         tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
-        axis = np.zeros(start.x.size + 1)
-        axis[-1] = sign
-        return tracer.follow(np.append(start.x, value), axis)
+        return tracer.follow(np.append(start.x, value), unit_axis(start.x.size + 1, sign))
 
     if direction:
         return trace(direction).branch(parameter)
@@ -246,10 +268,7 @@ def switch_branch(
     doubles = bifurcation.kind == "period doubling"
     values, vectors = np.linalg.eig(orbit.jacobian)
     vector = vectors[:, np.abs(values - (-1.0 if doubles else 1.0)).argmin()].real
-    problem = OrbitProblem(
-        orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2,
-        orbit.periods * (2 if doubles else 1), (parameter,),
-    )  # fmt: skip
+    problem = OrbitProblem(orbit.period_map, orbit.periods * (2 if doubles else 1), parameter)
     tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
     start = np.append(orbit.x, problem.start())
     return tracer.follow(start, side * np.append(vector, 0.0), leaves=True).branch(parameter)
@@ -362,7 +381,7 @@ class _Trace:
             return
         turn_cos = float((new.tangent * weights) @ (tangent * weights))
         if not self._limits[0] <= new.z[-1] <= self._limits[1]:
-            limited = self._at_limit(last, new, weights)
+            limited = self._at_limit(last, new)
             if limited is not None:
                 new = limited
                 self._finish("range end", new.z[-1])
@@ -386,7 +405,7 @@ class _Trace:
             self._finished = False
             self._reject(0.5)
             return
-        if not self._finished and self._closes(last, new, weights):
+        if not self._finished and len(self.points) >= 5 and passes(self._start, last, new, weights):
             new = self._start
             self._finish("closed loop", new.z[-1])
         try:
@@ -411,8 +430,7 @@ class _Trace:
         except NoConvergence:
             if step > BEND_STEP:
                 raise
-        axis = np.zeros(guess.size)
-        axis[-1] = math.copysign(1.0 / weights[-1], tangent[-1])
+        axis = unit_axis(guess.size, math.copysign(1.0 / weights[-1], tangent[-1]))
         return correct(self._problem.evaluate, guess, axis, weights, reach)
 
     def _accept(self, last: Point, new: Point) -> None:
@@ -477,33 +495,11 @@ class _Trace:
             raise NoConvergence(residual)
         return CurvePoint(z[:-1], last.tangent, last.weights, 0.0, evaluation, 0)
 
-    def _at_limit(self, last: Point, new: Point, weights: Float1D) -> Point | None:
+    def _at_limit(self, last: Point, new: Point) -> Point | None:
         """Return the point at the limit of the range between two points, None if it fails."""
-        limit = self._limits[0] if new.z[-1] < self._limits[0] else self._limits[1]
-        fraction = (limit - last.z[-1]) / (new.z[-1] - last.z[-1])
-        guess = last.z + fraction * (new.z - last.z)
-        guess[-1] = limit
-        axis = np.zeros(guess.size)
-        axis[-1] = math.copysign(1.0, new.z[-1] - last.z[-1])
-        try:
-            point = correct(self._problem.evaluate, guess, axis, weights)
-        except NoConvergence:
-            return None
-        return point if contact_key(point.linearization.result.contacts) == self._key else None
-
-    def _closes(self, last: Point, new: Point, weights: Float1D) -> bool:
-        """Return whether the branch passes its start between two points, in the same direction."""
-        if len(self.points) < 5:
-            return False
-        chord = (new.z - last.z) * weights
-        offset = (self._start.z - last.z) * weights
-        length = math.sqrt(chord @ chord)
-        along = (offset @ chord) / length
-        across = math.sqrt(max(float(offset @ offset - along * along), 0.0))
-        same_way = (self._start.tangent * weights) @ chord > 0.8 * length * weighted_length(
-            self._start.tangent, weights
-        )
-        return bool(0 < along <= length and across < 0.1 * length and same_way)
+        point = correct_at_limit(self._problem.evaluate, last, new, np.array([self._limits]))
+        is_regular = point and contact_key(point.linearization.result.contacts) == self._key
+        return point if is_regular else None
 
     def _pass_grazing(self, last: Point, new: Point, key: ContactKey) -> None:
         """Locate the grazing orbit between two points and go on behind it."""
@@ -594,7 +590,7 @@ class _Trace:
         """Record the grazing orbit that is the last point; it is left along `tangent`."""
         point, index = self.points[-1], len(self.points) - 1
         nearest = minima[np.abs(minima[:, 2]).argmin()]
-        limit = abs(nearest[2]) + SIMULTANEOUS_TOL * orbit_size(point.orbit)
+        limit = abs(nearest[2]) + SIMULTANEOUS_TOL * point.orbit.size_m
         sides = {int(code) % 2 for code in minima[np.abs(minima[:, 2]) <= limit, 1]}
         self.bifurcations.append(
             Bifurcation(
@@ -610,66 +606,3 @@ class _Trace:
         self._append(new)
         self._multipliers = floquet_multipliers(new.linearization.result.jacobian)
         self._point, self._step, self._curvature = new, STEP_BEYOND_GRAZING, np.zeros(new.z.size)
-
-
-def null_direction(jacobian: Float2D, ahead: Float1D, weights: Float1D) -> Float1D:
-    """Return the unit vector of the null space of a Jacobian (m, m + 1), towards `ahead`."""
-    vector = np.linalg.svd(jacobian / weights)[2][-1] / weights
-    return vector if (vector * weights) @ (ahead * weights) > 0 else -vector
-
-
-def border_sign(jacobian: Float2D, tangent: Float1D, weights: Float1D) -> float:
-    """Return the sign of the determinant of a Jacobian bordered by a tangent."""
-    return float(np.sign(np.linalg.det(np.vstack([jacobian, tangent * weights * weights]))))
-
-
-def locate_on_arc(
-    evaluate: Callable[[Float1D], Evaluation],
-    first: Point,
-    second: Point,
-    value: Callable[[Point], float],
-) -> Point:
-    """Return the point of a branch between two others at which a function of it is zero.
-
-    Each iterate is a point of the branch, in a plane normal to the chord; bracketed secants
-    (Illinois) choose the plane.
-    """
-    chord, weights = second.z - first.z, first.weights
-    length = weighted_length(chord, weights)
-    low, high, low_value, high_value = 0.0, 1.0, value(first), value(second)
-    point, side = second, 0
-    for _ in range(60):
-        if (high - low) * length < LOCATION_TOL or low_value == high_value:
-            break
-        position = low - low_value * (high - low) / (high_value - low_value)
-        if not low < position < high:
-            position = (low + high) / 2
-        near = first if position < 0.5 else second
-        base = near.z + (position - (0.0 if near is first else 1.0)) * chord
-        previous = point
-        try:
-            point = correct(
-                evaluate, base if previous is second else _shift(previous, first, chord, position),
-                chord / length, weights, tolerance=1e-9,
-            )  # fmt: skip
-        except NoConvergence:
-            break
-        here = value(point)
-        if here == 0.0 or point.distance(previous.z) < LOCATION_TOL:
-            break
-        if here * low_value > 0:
-            low, low_value = position, here
-            high_value *= 0.5 if side == -1 else 1.0
-            side = -1
-        else:
-            high, high_value = position, here
-            low_value *= 0.5 if side == 1 else 1.0
-            side = 1
-    return point
-
-
-def _shift(point: Point, first: Point, chord: Float1D, position: float) -> Float1D:
-    """Return the point on a tangent in the plane at `position` of a chord."""
-    normal = chord * first.weights * first.weights
-    distance = position * (normal @ chord) - normal @ (point.z - first.z)
-    return point.z + distance / (normal @ point.tangent) * point.tangent

@@ -23,16 +23,22 @@ from table_io.block import Float1D
 from table_io.errors import InputError
 from twin.dynamics.bifurcations import Bifurcation
 from twin.dynamics.continuation import Branch, BranchEnd, continue_branch, switch_branch
-from twin.dynamics.orbits import Orbit, OrbitProblem, find_orbit, motion_size
-from twin.dynamics.period_map import FREQUENCY, LEVEL, PeriodMap, make_period_map
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.orbits import (
+    SAME_ORBIT,
+    Orbit,
+    find_attracting_orbit,
+    find_orbit,
+    motion_size,
+    reduce_period,
+)
+from twin.dynamics.period_map import FREQUENCY, LEVEL, PeriodMap
 from twin.model.model import Model
 
 MAX_PERIODS = 8  # of the orbits that are sought
 VALUES, STARTS = 121, 8  # of the parameter, and new starts at each of them
 SETTLING_CHUNK, MAX_SETTLING = 24, 480  # periods between two looks at a motion, and in all
 RETURN_TOL = 1e-3  # of the size: a motion that returns so close is refined by Newton's method
-SAME_ORBIT = 1e-5  # of the size: distance of two orbits that are the same
-NEAR_ORBIT = 0.5  # of the size: distance of interpolated orbits that are worth refining
 LYAPUNOV_PERIODS = 300
 MIN_EXPONENT = 0.02  # per period: a smaller exponent is not told from zero
 MAX_BRANCH_POINTS = 1200  # divided by the periods of its orbits: long orbits are costly
@@ -79,15 +85,13 @@ class Diagram:
         orbits: list[Orbit] = []
         for branch in self.branches:
             for orbit in branch.orbits_at(value):
-                if (orbit.stable or not stable_only) and not any(
-                    are_same(orbit, other) for other in orbits
-                ):
+                if (orbit.stable or not stable_only) and not any(map(orbit.is_same, orbits)):
                     orbits.append(orbit)
         return orbits
 
     def find_branch(self, orbit: Orbit) -> Branch | None:
         """Return the branch on which an orbit lies, at any of its phases, or None."""
-        return next((b for b in self.branches if lies_on(orbit, b)), None)
+        return next((b for b in self.branches if b.contains(orbit)), None)
 
 
 def compute_diagram(
@@ -110,7 +114,8 @@ def compute_diagram(
     _validate(limits, acceleration_m_s2, parameter, frequency_hz, values)
     frequency = limits[0] if parameter == FREQUENCY else frequency_hz
     level = limits[0] if parameter == LEVEL else acceleration_m_s2
-    search = _Search(make_period_map(model), parameter, limits, frequency, level, starts, seed)
+    period_map = make_period_map(model, frequency, level)
+    search = _Search(period_map, parameter, limits, starts, seed)
     search.run(values)
     return Diagram(
         search.period_map, parameter, limits, tuple(search.branches), search.find_bands(),
@@ -147,11 +152,15 @@ class _Search:
     """Branches found so far, and what is known at the values that were tried."""
 
     def __init__(
-        self, period_map: PeriodMap, parameter: str, limits: tuple[float, float],
-        frequency_hz: float, level: float, starts: int, seed: int,
-    ) -> None:  # fmt: skip
+        self,
+        period_map: PeriodMap,
+        parameter: str,
+        limits: tuple[float, float],
+        starts: int,
+        seed: int,
+    ) -> None:
         self.period_map, self._parameter, self._limits = period_map, parameter, limits
-        self._problem = OrbitProblem(period_map, frequency_hz, level, 1, (parameter,))
+        period_map.parameter(parameter)  # refuses an unknown one
         self._starts, self._random = starts, np.random.default_rng(seed)
         self.branches: list[Branch] = []
         self._switched: list[Orbit] = []  # at bifurcations whose branches have been followed
@@ -189,9 +198,8 @@ class _Search:
         for _ in range(MAX_CONFIRMATION * starts_in_a_row):
             drawn = self._random.uniform(*limits)
             value = float(np.exp(drawn) if is_logarithmic else drawn)
-            period_map, frequency_hz, level = self._problem.at([value])
-            start = draw_start(period_map, frequency_hz, level, self._random)
-            motion = settle(period_map, frequency_hz, level, start)
+            period_map = self.period_map.with_parameter(self._parameter, value)
+            motion = settle(period_map, draw_start(period_map, self._random))
             if motion.orbit is not None:
                 confirmed = 0 if self.add_orbit(motion.orbit) else confirmed + 1
             elif motion.is_chaotic:
@@ -205,13 +213,13 @@ class _Search:
         """Settle the last motions and new starts at each value in turn."""
         carried: list[Float1D] = []
         for value in values:
-            period_map, frequency_hz, level = self._problem.at([float(value)])
-            new = [draw_start(period_map, frequency_hz, level, self._random) for _ in range(starts)]
+            period_map = self.period_map.with_parameter(self._parameter, float(value))
+            new = [draw_start(period_map, self._random) for _ in range(starts)]
             ends: list[Float1D] = []
             orbits: list[Orbit] = []
             exponent = self._exponents.get(value, 0.0)
             for x in [*carried, *([period_map.rest()] if starts else []), *new]:
-                motion = settle(period_map, frequency_hz, level, x, known=orbits)
+                motion = settle(period_map, x, known=orbits)
                 if motion.orbit is not None:
                     if motion.orbit not in orbits:
                         orbits.append(motion.orbit)
@@ -234,7 +242,7 @@ class _Search:
 
         Return whether it was such an orbit.
         """
-        if any(lies_on(orbit, branch) for branch in self.branches):
+        if any(branch.contains(orbit) for branch in self.branches):
             return False
         branch = cut_repetition(
             continue_branch(
@@ -332,7 +340,7 @@ def is_covered(branch: Branch, others: Sequence[Branch]) -> bool:
         return True  # too short to tell from the branch that it leaves
     # Not at its ends, where branches meet.
     orbits = [branch.points[i].orbit for i in (count // 4, count // 2, 3 * count // 4)]
-    return all(any(lies_on(orbit, other) for other in others) for orbit in orbits)
+    return all(any(other.contains(orbit) for other in others) for orbit in orbits)
 
 
 def cut_repetition(branch: Branch) -> Branch:
@@ -377,9 +385,7 @@ def cut_half_period(branch: Branch) -> Branch:
     )  # fmt: skip
 
 
-def draw_start(
-    period_map: PeriodMap, frequency_hz: float, level: float, random: np.random.Generator
-) -> Float1D:
+def draw_start(period_map: PeriodMap, random: np.random.Generator) -> Float1D:
     """Return coordinates of a start: energies from far below to above those of any response.
 
     The speed of a damped oscillator stays below level M / C; without damping, below what a period
@@ -387,7 +393,7 @@ def draw_start(
     """
     p = period_map.model.parameters
     w = math.sqrt(p.stiffness / p.mass)
-    fastest = level / max(p.damping / p.mass, 0.02 * w)
+    fastest = period_map.acceleration_m_s2 / max(p.damping / p.mass, 0.02 * w)
     amplitude, angle = 1.5 * 10 ** random.uniform(-2.0, 0.0), random.uniform(0, 2 * math.pi)
     x = period_map.rest()
     x[0] += amplitude * fastest / w * math.cos(angle)
@@ -410,8 +416,6 @@ class SettledMotion:
 
 def settle(
     period_map: PeriodMap,
-    frequency_hz: float,
-    acceleration_m_s2: float,
     start: Float1D,
     max_periods: int = MAX_PERIODS,
     known: Sequence[Orbit] = (),
@@ -420,118 +424,31 @@ def settle(
 
     A motion that comes close to one of the `known` stable orbits ends there.
     """
-    f, a, scales, x = frequency_hz, acceleration_m_s2, period_map.scales, start
+    scales, x = period_map.scales, start
     for _ in range(MAX_SETTLING // (SETTLING_CHUNK + max_periods)):
-        x = period_map.iterate(x, f, a, SETTLING_CHUNK)
+        x = period_map.iterate(x, SETTLING_CHUNK)
         if not np.isfinite(x).all():
             return SettledMotion(x, None)
         first, size = x, 1e-12
         for periods in range(1, max_periods + 1):
-            x = period_map.iterate(x, f, a, 1)
+            x = period_map.iterate(x, 1)
             size = max(size, motion_size(x, scales))
             if motion_size(x - first, scales) < RETURN_TOL * size:
                 for attractor in known:
                     if motion_size(attractor.x - x, scales) < RETURN_TOL * size:
                         return SettledMotion(x, attractor)
-                orbit = find_orbit(period_map, f, a, x, periods)
-                if (
-                    orbit is not None
-                    and orbit.stable
-                    and motion_size(orbit.x - x, scales) < 100 * RETURN_TOL * size
-                ):
-                    return SettledMotion(x, reduce_period(orbit))
+                orbit = find_attracting_orbit(period_map, x, periods, size)
+                if orbit is not None:
+                    return SettledMotion(x, orbit)
                 break
-    exponent, x = estimate_lyapunov_exponent(period_map, f, a, x, LYAPUNOV_PERIODS)
-    return SettledMotion(x, None, exponent)
-
-
-def estimate_lyapunov_exponent(
-    period_map: PeriodMap, frequency_hz: float, acceleration_m_s2: float, x: Float1D, periods: int
-) -> tuple[float, Float1D]:
-    """Return (largest Lyapunov exponent per period, x `periods` later)."""
-    scales, growth = period_map.scales, 0.0
-    variation = np.ones(x.size)
-    for _ in range(periods):
-        result = period_map.evaluate(x, frequency_hz, acceleration_m_s2)
-        variation = result.jacobian @ (variation * scales) / scales
-        length = float(np.linalg.norm(variation))
-        growth += math.log(max(length, 1e-300))
-        variation, x = variation / max(length, 1e-300), result.end
-    return growth / periods, x
-
-
-def orbit_phases(orbit: Orbit) -> Iterator[Float1D]:
-    """Yield the coordinates of an orbit at each period of the drive."""
-    x = orbit.x
-    yield x
-    for _ in range(orbit.periods - 1):
-        x = orbit.period_map.iterate(x, orbit.frequency_hz, orbit.acceleration_m_s2, 1)
-        yield x
-
-
-def reduce_period(orbit: Orbit) -> Orbit:
-    """Return an orbit with its least period; itself if that is what it has."""
-    scales = orbit.period_map.scales
-    phases = list(orbit_phases(orbit))
-    limit = SAME_ORBIT * motion_size(orbit.x, scales)
-    for periods in range(1, orbit.periods // 2 + 1):
-        if orbit.periods % periods == 0 and motion_size(phases[periods] - orbit.x, scales) < limit:
-            reduced = find_orbit(
-                orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.x, periods
-            )
-            return orbit if reduced is None else reduced
-    return orbit
+    growth, x = period_map.measure_growth(x, LYAPUNOV_PERIODS)
+    return SettledMotion(x, None, float(growth.mean()))
 
 
 def are_at_same_place(orbit: Orbit, other: Orbit, parameter: str) -> bool:
     """Return whether two located bifurcations are one, up to whole periods."""
-    value, own = (parameter_value(o, parameter) for o in (orbit, other))
-    return abs(value - own) < SAME_ORBIT * abs(value) and are_same(orbit, other)
-
-
-def are_same(orbit: Orbit, other: Orbit) -> bool:
-    """Return whether two orbits at the same parameters are one, up to whole periods."""
-    if orbit.periods != other.periods:
-        return False
-    scales = orbit.period_map.scales
-    limit = SAME_ORBIT * max(motion_size(orbit.x, scales), motion_size(other.x, scales))
-    return any(motion_size(x - other.x, scales) < limit for x in orbit_phases(orbit))
-
-
-def lies_on(orbit: Orbit, branch: Branch) -> bool:
-    """Return whether an orbit is one of a branch, at any of its phases."""
-    if branch.points[0].orbit.periods != orbit.periods:
-        return False
-    value = parameter_value(orbit, branch.parameter)
-    scales, phases = orbit.period_map.scales, list(orbit_phases(orbit))
-    size = max(motion_size(x, scales) for x in phases)
-    limit = SAME_ORBIT * size
-    for first, second in zip(branch.points, branch.points[1:], strict=False):
-        if (first.value - value) * (second.value - value) > 0:
-            continue
-        span = second.value - first.value
-        fraction = (value - first.value) / span if span else 0.0
-        guess = first.orbit.x + fraction * (second.orbit.x - first.orbit.x)
-        near = min(motion_size(x - guess, scales) for x in phases)
-        if near > NEAR_ORBIT * size + motion_size(second.orbit.x - first.orbit.x, scales):
-            continue
-        if near < limit:
-            return True
-        refined = find_orbit(
-            orbit.period_map, orbit.frequency_hz, orbit.acceleration_m_s2, guess, orbit.periods
-        )
-        if refined is not None and min(motion_size(x - refined.x, scales) for x in phases) < limit:
-            return True
-    return False
-
-
-def parameter_value(orbit: Orbit, parameter: str) -> float:
-    """Return the value of a parameter at an orbit."""
-    if parameter == FREQUENCY:
-        return orbit.frequency_hz
-    if parameter == LEVEL:
-        return orbit.acceleration_m_s2
-    return orbit.period_map.parameter(parameter)
+    value, own = (each.period_map.parameter(parameter) for each in (orbit, other))
+    return abs(value - own) < SAME_ORBIT * abs(value) and orbit.is_same(other)
 
 
 def mirror_orbit(orbit: Orbit) -> Orbit | None:
@@ -544,19 +461,12 @@ def mirror_orbit(orbit: Orbit) -> Orbit | None:
         p.bumper_stiffness_l, p.bumper_damping_l, p.gap_l,
     ):  # fmt: skip
         return None
-    f, a, n = orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods
-    scales, size = period_map.scales, motion_size(orbit.x, period_map.scales)
-    u, v, _, _, _, u_r, u_l = period_map.sample_motion(orbit.x, f, a, 1, 2)[:, 0]
-    x = period_map.rest()
-    # Hidden states of effects are those of a settled motion.
-    for index, value in enumerate((-u, -v, -u_l, -u_r)[: x.size]):
-        x[index] = value
-    if x.size > 4 or (x.size > 2 and p.bumper_damping_r == 0):
-        x = period_map.iterate(x, f, a, n * math.ceil(SETTLING_CHUNK / n))
-    image = find_orbit(period_map, f, a, x, n)
-    if image is None or any(
-        motion_size(y - image.x, scales) < SAME_ORBIT * size for y in orbit_phases(orbit)
-    ):
+    n, size = orbit.periods, motion_size(orbit.x, period_map.scales)
+    x = period_map.mirror(orbit.x)
+    if x.size > 4 or (x.size > 2 and p.bumper_damping_r == 0):  # hidden states of effects
+        x = period_map.iterate(x, n * math.ceil(SETTLING_CHUNK / n))
+    image = find_orbit(period_map, x, n)
+    if image is None or orbit.passes(image.x, SAME_ORBIT * size):
         return None
     is_image = abs(image.u_max + orbit.u_min) + abs(image.u_min + orbit.u_max) < 1e-4 * size
     return image if is_image else None

@@ -13,22 +13,16 @@ wide; one-sided for a coordinate at its bound, such as a relaxed face.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
-from table_io.block import Float1D, Float2D
-from twin.dynamics.event_driven_kernel import advance_periods
-from twin.dynamics.period_map import (
-    FREQUENCY,
-    LEVEL,
-    TOUCH_TOL_M,
-    MapResult,
-    change_parameter,
-    find_parameter,
-)
+from table_io.block import Bool1D, Float1D, Float2D
+from twin.dynamics.closed_form_map import ClosedFormMap
+from twin.dynamics.period_map import FREQUENCY, LEVEL, TOUCH_TOL_M, MapResult, PeriodMap
 from twin.laws.effect import PLACES, Effect
 from twin.laws.properties import LawProperties, evaluate_law, sum_law_properties
 from twin.model.event_integrator import EventDrivenSolver, kernel_coefficients, set_substeps
@@ -36,7 +30,9 @@ from twin.model.event_integrator_kernel import (
     CONTACT_L,
     CONTACT_R,
     DIRECTION,
+    REVERSAL_GUARD,
     STATE_B_R,
+    STATE_BASE,
     STATE_F,
     STATE_S,
     STATE_SIZE,
@@ -44,11 +40,12 @@ from twin.model.event_integrator_kernel import (
     U_R,
     U,
     V,
+    build_kernel,
 )
-from twin.model.event_location import REVERSAL_GUARD
 from twin.model.force_laws import AddedLaws, Coefficients
 from twin.model.model import Model
 from twin.model.solver import OUTPUT_COUNT
+from twin.model.stepped_sine import EXTREME_NAMES, validate_frequencies
 
 SAMPLES_PER_CYCLE = 128
 EXTREMES_SAMPLES_PER_CYCLE = 1024  # of accelerations and forces; those of u are exact
@@ -59,87 +56,73 @@ MAX_HYSTERESIS = 1 - 1e-12  # of the hysteretic variable
 MAX_EVENTS = 4000  # logged in one evaluation
 SMALL_MOTION_M = 1e-3  # m: at which added laws are probed
 
-
-Bool1D = npt.NDArray[np.bool_]
+PERTURBATION_M = 1e-8  # m: of the neighboring motion whose separation is the growth
 
 _NO_PROPAGATORS = np.zeros((8, 1))  # of exact linear propagation, which is not used here
+_NO_EVENTS = np.empty((0, 4))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SampledDrive:
-    """What `advance_periods` needs at one frequency and level."""
+class SampledDrive(NamedTuple):
+    """A period of the drive on samples, and the coefficients of the steps between them."""
+
+    coefficients: Coefficients
+    base_acc: Float1D  # m/s2, what drives the mass
+    added_acc: Float1D  # m/s2, the part of it that is not the table's acceleration
+
+
+class _Prepared(NamedTuple):
+    """What the maps of a model have in common; a linear model too is integrated.
+
+    The exact propagators of a linear model cost more than the few periods that they serve.
+    indices: of the coordinates in a state of the solver.
+    """
 
     coefficients: Coefficients
     laws: AddedLaws | None
-    base_acc: Float1D  # m/s2, what drives the mass
-    added_acc: Float1D | None  # m/s2, the part of it that is not the table's acceleration
-
-    def advance(self, states: Float2D, periods: int, motion: Float2D | None = None) -> Float2D:
-        """Advance states (m, STATE_SIZE) in place, through `periods` times the samples.
-
-        Return the events of all rows in turn, (n, 4) as in `advance_step`. motion (7, n periods):
-        `closed_form.OUTPUT_NAMES` of the last row.
-        """
-        events = np.zeros((MAX_EVENTS + 1, 4))
-        advance_periods(
-            states, self.coefficients, _NO_PROPAGATORS, self.laws, self.base_acc, periods, events,
-            np.empty((OUTPUT_COUNT, 0)) if motion is None else motion,
-        )  # fmt: skip
-        if motion is not None and self.added_acc is not None:
-            motion[2] -= np.tile(self.added_acc, periods)
-        return events[: min(int(events[-1, 0]), MAX_EVENTS)]
+    law_properties: dict[int, LawProperties]
+    indices: list[int]
 
 
-@dataclass(frozen=True, eq=False)
-class EventDrivenMap:
-    """Map of a model with any effects; InputError if the model changes with time."""
+@lru_cache(maxsize=64)
+def _prepare(model: Model) -> _Prepared:
+    """Return what the maps of a model at all frequencies and levels have in common."""
+    coefficients, laws = kernel_coefficients(model)
+    p, added = model.parameters, model.added_laws
 
-    model: Model
-
-    def __post_init__(self) -> None:
-        self.model.require_steady_state()
-
-    @cached_property
-    def _kernel(self) -> tuple[Coefficients, AddedLaws | None]:
-        """Coefficients and added laws; a linear model too is integrated.
-
-        The exact propagators of a linear model cost more than the few periods that they serve.
-        """
-        coefficients, laws = kernel_coefficients(self.model)
-        return coefficients._replace(is_linear=False), laws
-
-    @cached_property
-    def _law_properties(self) -> dict[int, LawProperties]:
-        return sum_law_properties(self.model.added_laws)
-
-    @cached_property
-    def _indices(self) -> list[int]:
-        """Indices of the coordinates in a state of the solver."""
-        p, (coefficients, _) = self.model.parameters, self._kernel
-        sides = [side for side, gap in enumerate((p.gap_r, p.gap_l)) if math.isfinite(gap)]
-        indices = [U, V, *(U_R + side for side in sides if self._has_memory(side))]
-        if coefficients.k1:
-            indices.append(STATE_F)
-        if coefficients.kb:
-            indices += [STATE_B_R + side for side in sides]
-        if coefficients.fy:
-            indices.append(STATE_Z)
-        count = sum(len(PLACES[e.place]) * len(e.states) for e, _ in self.model.added_laws)
-        return [*indices, *range(STATE_S, STATE_S + count)]
-
-    def _has_memory(self, side: int) -> bool:
+    def has_memory(side: int) -> bool:
         """Return whether a released face takes time to recover."""
-        p, (coefficients, _) = self.model.parameters, self._kernel
         if (p.bumper_damping_r, p.bumper_damping_l)[side] or coefficients.ch or coefficients.kb:
             return True
         return any(
             side in PLACES[effect.place] and has_dashpot(effect, constants)
-            for effect, constants in self.model.added_laws
+            for effect, constants in added
         )
 
+    sides = [side for side, gap in enumerate((p.gap_r, p.gap_l)) if math.isfinite(gap)]
+    indices = [U, V, *(U_R + side for side in sides if has_memory(side))]
+    if coefficients.k1:
+        indices.append(STATE_F)
+    if coefficients.kb:
+        indices += [STATE_B_R + side for side in sides]
+    if coefficients.fy:
+        indices.append(STATE_Z)
+    count = sum(len(PLACES[effect.place]) * len(effect.states) for effect, _ in added)
+    indices += range(STATE_S, STATE_S + count)
+    linear = coefficients._replace(is_linear=False)
+    return _Prepared(linear, laws, sum_law_properties(added), indices)
+
+
+@dataclass(frozen=True, eq=False)
+class EventDrivenMap(PeriodMap):
+    """Map of a model with any effects that do not change with time."""
+
     @cached_property
-    def size(self) -> int:
-        return len(self._indices)
+    def _prepared(self) -> _Prepared:
+        return _prepare(self.model)
+
+    @property
+    def indices(self) -> Sequence[int]:
+        return self._prepared.indices
 
     @cached_property
     def scales(self) -> Float1D:
@@ -149,7 +132,7 @@ class EventDrivenMap:
 
     def _scale(self, u: float, v: float, w: float) -> Float1D:
         """Return the size of each coordinate, (size,), in a motion of u m, v m/s at w 1/s."""
-        coefficients, _ = self._kernel
+        coefficients = self._prepared.coefficients
         sizes = np.full(STATE_SIZE, u)
         sizes[V], sizes[STATE_F], sizes[STATE_Z] = v, coefficients.k1 * u, u / coefficients.uy
         sizes[STATE_B_R : STATE_B_R + 2] = coefficients.kb * u
@@ -164,7 +147,7 @@ class EventDrivenMap:
                 for _ in PLACES[effect.place]:
                     sizes[index : index + len(rates)] = np.abs(rates) / (small * w)
                     index += len(rates)
-        own = sizes[self._indices]
+        own = sizes[self.indices]
         own[own == 0.0] = u
         return own
 
@@ -173,34 +156,55 @@ class EventDrivenMap:
         return FREQUENCY, LEVEL
 
     def _make_drive(
-        self,
-        frequency_hz: float,
-        acceleration_m_s2: float,
-        samples: int = SAMPLES_PER_CYCLE,
-        periods: int = 1,
-        step_frequency_hz: float = 0.0,
+        self, samples: int = SAMPLES_PER_CYCLE, periods: int = 1, stepped_hz: float = 0.0
     ) -> SampledDrive:
-        """Return a sin(2 pi f t) on `samples` samples of `periods` periods.
+        """Return the drive on `samples` samples of `periods` periods.
 
-        With as many substeps as at `step_frequency_hz`, if given: they change with the frequency,
-        a difference must not.
+        With as many substeps as at the frequency `stepped_hz`, if given: they change with the
+        frequency, a difference must not.
         """
-        coefficients, laws = self._kernel
-        rate_hz = samples / periods * (step_frequency_hz or frequency_hz)
-        substeps = set_substeps(
-            coefficients, rate_hz / STEP_REFINEMENT, self._law_properties
-        ).substeps
-        period_s = periods / (samples * frequency_hz)
-        coefficients = coefficients._replace(
-            period=period_s, substeps=substeps, step=period_s / substeps
-        )
+        prepared, f = self._prepared, self.frequency_hz
+        rate_hz = samples / periods * (stepped_hz or f) / STEP_REFINEMENT
+        coefficients = set_substeps(prepared.coefficients, rate_hz, prepared.law_properties)
+        period_s = periods / (samples * f)
+        coefficients = coefficients._replace(period=period_s, step=period_s / coefficients.substeps)
         phases = 2 * math.pi * periods * np.arange(1, samples + 1) / samples
-        base = acceleration_m_s2 * np.sin(phases)
-        added = self.model.added_acceleration(-base / (2 * math.pi * frequency_hz) ** 2)
-        if added is not None:
-            base = base + added
-        harmonics = np.fft.rfft(base) / np.sinc(np.arange(samples // 2 + 1) / samples) ** 2
-        return SampledDrive(coefficients, laws, np.fft.irfft(harmonics, samples), added)
+        table_acc = self.acceleration_m_s2 * np.sin(phases)
+        added = self.model.added_acceleration(-table_acc / (2 * math.pi * f) ** 2)
+        added = np.zeros(samples) if added is None else added
+        harmonics = np.fft.rfft(table_acc + added)
+        harmonics = harmonics / np.sinc(np.arange(samples // 2 + 1) / samples) ** 2
+        return SampledDrive(coefficients, np.fft.irfft(harmonics, samples), added)
+
+    @cached_property
+    def _drive(self) -> SampledDrive:
+        return self._make_drive()
+
+    def _advance(
+        self, states: Float2D, drive: SampledDrive, samples: int, out: Float2D, events: Float2D
+    ) -> int:
+        """Advance states (m, STATE_SIZE) in place by samples from phase 0; return events.
+
+        out (7, samples): `closed_form.OUTPUT_NAMES` of the last row. A row that becomes infinite
+        is NaN. events (k, 4) as in `integrate_samples`; their number, both of the last row.
+        """
+        integrate, count = build_kernel(self._prepared.laws is not None), 0
+        base = np.resize(drive.base_acc, samples)
+        for state in states:
+            state[STATE_BASE] = drive.base_acc[-1]
+            count = integrate(
+                state, drive.coefficients, _NO_PROPAGATORS, self._prepared.laws, base, out, events
+            )
+            if not math.isfinite(state[U]):
+                state[:] = math.nan
+        out[2] -= np.resize(drive.added_acc, samples)
+        return count
+
+    def _advance_periods(self, states: Float2D, periods: int) -> Float2D:
+        """Return the coordinates (m, n) whole periods after states (m, STATE_SIZE)."""
+        samples = periods * SAMPLES_PER_CYCLE
+        self._advance(states, self._drive, samples, np.empty((OUTPUT_COUNT, samples)), _NO_EVENTS)
+        return states[:, self.indices]
 
     def _make_states(self, x: Float2D) -> Float2D:
         """Return the solver's states (m, STATE_SIZE) at coordinates (m, size).
@@ -210,19 +214,19 @@ class EventDrivenMap:
         The solver itself ends a contact that would pull, or a stick that friction cannot hold.
         """
         states, p = np.zeros((len(x), STATE_SIZE)), self.model.parameters
-        states[:, self._indices] = x
+        states[:, self.indices] = x
         u, v, z = states[:, U], states[:, V], states[:, STATE_Z]
         for side, gap, sign in ((0, p.gap_r, 1.0), (1, p.gap_l, -1.0)):
             face, depth = states[:, U_R + side], sign * u - gap
             contact = depth >= sign * face - TOUCH_TOL_M
             states[:, CONTACT_R + side] = contact
-            if U_R + side in self._indices:
+            if U_R + side in self.indices:
                 lag = depth - sign * face
                 v[contact] -= (sign * self._contact_rate(side, depth) * lag)[contact]
             face[contact] = sign * depth[contact]
         np.clip(z, -MAX_HYSTERESIS, MAX_HYSTERESIS, out=z)
         direction = np.where(v < 0, -1.0, 1.0)
-        if self._kernel[0].fc > 0:
+        if self._prepared.coefficients.fc > 0:
             is_stuck = np.abs(v) <= STICK_TOL_M_S
             v[is_stuck] = direction[is_stuck] = 0.0
         states[:, DIRECTION] = direction
@@ -230,65 +234,53 @@ class EventDrivenMap:
 
     def _contact_rate(self, side: int, depth: Float1D) -> Float1D:
         """Return dashpot over mass in 1/s of a bumper at these depths in m, without added laws."""
-        coefficients = self._kernel[0]
+        coefficients = self._prepared.coefficients
         dashpot = coefficients.c_l if side else coefficients.c_r
         rate: Float1D = (dashpot + coefficients.ch * np.abs(depth)) / coefficients.m
         return rate
 
-    def evaluate(
-        self, x: Float1D, frequency_hz: float, acceleration_m_s2: float, periods: int = 1
-    ) -> MapResult:
-        f, a = frequency_hz, acceleration_m_s2
-        drive, states = self._make_drive(f, a), self._make_states(x[None])
-        contacts, x = states[0, [CONTACT_R, CONTACT_L]] > 0, states[0, self._indices]
-        motion = np.empty((OUTPUT_COUNT, SAMPLES_PER_CYCLE * periods))
-        events = drive.advance(states, periods, motion)
+    def evaluate(self, x: Float1D, periods: int = 1) -> MapResult:
+        f, a = self.frequency_hz, self.acceleration_m_s2
+        states, samples = self._make_states(x[None]), periods * SAMPLES_PER_CYCLE
+        contacts, x = states[0, [CONTACT_R, CONTACT_L]] > 0, states[0, self.indices]
+        motion, log = np.empty((OUTPUT_COUNT, samples)), np.empty((MAX_EVENTS, 4))
+        count = self._advance(states, self._drive, samples, motion, log)
+        end, events = states[0, self.indices], log[: min(count, MAX_EVENTS)].tolist()
         u, v = np.abs(motion[:2]).max(axis=1)
-        released = [int(guard) for time, guard, *_ in events.tolist() if time == 0.0 and guard < 2]
         pushes = contacts.copy()
-        pushes[released] = False
+        pushes[[int(guard) for time, guard, *_ in events if time == 0.0 and guard < 2]] = False
         steps = RELATIVE_STEP * np.maximum(np.abs(x), self._scale(u, v, 2 * math.pi * f))
-        jacobian = self._differentiate(x, contacts, pushes, steps, drive, periods)
+        jacobian = self._differentiate(x, contacts, pushes, steps, periods)
         d_parameters = np.empty((self.size, 2))
-        for j, (df, da) in enumerate(
-            ((RELATIVE_STEP * f, 0.0), (0.0, RELATIVE_STEP * (abs(a) or 1.0)))
+        for column, df, da in (
+            (0, RELATIVE_STEP * f, 0.0),
+            (1, 0.0, RELATIVE_STEP * (abs(a) or 1.0)),
         ):
             ends = []
             for sign in (1, -1):
-                moved = self._make_states(x[None])
-                varied = self._make_drive(f + sign * df, a + sign * da, step_frequency_hz=f)
-                varied.advance(moved, periods)
-                ends.append(moved[0, self._indices])
-            d_parameters[:, j] = (ends[0] - ends[1]) / (2 * (df + da))
+                varied = replace(self, frequency_hz=f + sign * df, acceleration_m_s2=a + sign * da)
+                moved, drive = self._make_states(x[None]), varied._make_drive(stepped_hz=f)
+                varied._advance(moved, drive, samples, motion, _NO_EVENTS)
+                ends.append(moved[0, self.indices])
+            d_parameters[:, column] = (ends[0] - ends[1]) / (2 * (df + da))
         regime, codes = int(contacts[0]) + 2 * int(contacts[1]), []
-        for time, guard, is_onset, _ in events.tolist():
+        for time, guard, is_onset, _ in events:
             if guard != REVERSAL_GUARD:
                 if time == 0.0:  # contacts that would pull, ended by the solver
                     regime ^= 1 << int(guard)
                 else:
                     codes.append(4 + int(guard) + 2 * int(is_onset))
-        return MapResult(
-            states[0, self._indices],
-            jacobian,
-            d_parameters,
-            (regime, *codes),
-            np.empty((0, 3 + self.size + 2)),
-        )
+        no_minima = np.empty((0, 3 + self.size + 2))
+        return MapResult(end, jacobian, d_parameters, (regime, *codes), no_minima)
 
     def _differentiate(
-        self,
-        x: Float1D,
-        contacts: Bool1D,
-        pushes: Bool1D,
-        steps: Float1D,
-        drive: SampledDrive,
-        periods: int,
+        self, x: Float1D, contacts: Bool1D, pushes: Bool1D, steps: Float1D, periods: int
     ) -> Float2D:
-        """Return d end / d x, (size, size); `contacts` of both sides at x, those that push."""
+        """Return d end / d x, (n, n); `contacts` of both sides at x, those that push."""
         # Row j varies coordinate j.
         upper, lower = x + np.diag(steps), x - np.diag(steps)
         touching: list[tuple[int, int]] = []
-        for j, index in enumerate(self._indices):
+        for j, index in enumerate(self.indices):
             if index in (U_R, U_R + 1):
                 side = index - U_R
                 if contacts[side]:  # it follows u
@@ -300,8 +292,7 @@ class EventDrivenMap:
                 upper[j, j] = min(upper[j, j], MAX_HYSTERESIS)
                 lower[j, j] = max(lower[j, j], -MAX_HYSTERESIS)
         states = self._make_states(np.concatenate([upper, lower]))
-        drive.advance(states, periods)
-        ends, widths = states[:, self._indices], np.diag(upper) - np.diag(lower)
+        ends, widths = self._advance_periods(states, periods), np.diag(upper) - np.diag(lower)
         jacobian: Float2D = ((ends[: self.size] - ends[self.size :]) / widths[:, None]).T
         for j, side in touching:
             # As through an onset: u_j becomes u, u' changes by C_j / M (u_j - u).
@@ -310,54 +301,79 @@ class EventDrivenMap:
             jacobian[:, 0] -= jacobian[:, j]
         return jacobian
 
-    def iterate(
-        self, x: Float1D, frequency_hz: float, acceleration_m_s2: float, periods: int
-    ) -> Float1D:
-        states = self._make_states(x[None])
-        self._make_drive(frequency_hz, acceleration_m_s2).advance(states, periods)
-        return states[0, self._indices]
+    def record(self, x: Float1D, periods: int) -> Float2D:
+        points = np.empty((periods, self.size))
+        for point in points:
+            x = self._advance_periods(self._make_states(x[None]), 1)[0]
+            point[:] = x
+        return points
+
+    def advance_half(self, x: Float1D) -> Float1D:
+        states, samples = self._make_states(x[None]), SAMPLES_PER_CYCLE // 2
+        self._advance(states, self._drive, samples, np.empty((OUTPUT_COUNT, samples)), _NO_EVENTS)
+        return states[0, self.indices]
 
     def rest(self) -> Float1D:
-        coefficients, laws = self._kernel
-        solver = EventDrivenSolver(
-            self.model, self.model.parameters, coefficients, _NO_PROPAGATORS, laws
-        )
-        return solver.rest_state()[self._indices]
+        coefficients, laws, _, indices = self._prepared
+        p = self.model.parameters
+        solver = EventDrivenSolver(self.model, p, coefficients, _NO_PROPAGATORS, laws)
+        return solver.rest_state()[indices]
 
     def to_state(self, x: Float1D) -> Float1D:
         state: Float1D = self._make_states(x[None])[0]
         return state
 
-    def find_extremes(
-        self, x: Float1D, frequency_hz: float, acceleration_m_s2: float, periods: int = 1
-    ) -> Float1D:
-        samples = EXTREMES_SAMPLES_PER_CYCLE * periods
-        drive = self._make_drive(frequency_hz, acceleration_m_s2, samples, periods)
+    def measure_periods(self, x: Float1D, periods: int) -> Float2D:
+        drive = self._make_drive(EXTREMES_SAMPLES_PER_CYCLE)
         # Reversals as events, so that the extremes of u are exact.
-        drive = replace(drive, coefficients=drive.coefficients._replace(has_reversals=True))
-        states, motion = self._make_states(x[None]), np.empty((OUTPUT_COUNT, samples))
-        events = drive.advance(states, 1, motion)
-        u = np.concatenate([x[:1], motion[0], events[events[:, 1] == REVERSAL_GUARD, 3]])
-        onsets = [np.count_nonzero((events[:, 1] == side) & (events[:, 2] > 0)) for side in (0, 1)]
-        return np.array([
-            u.max(), u.min(), motion[2].max(), motion[2].min(), motion[3].max(), motion[4].min(),
-            *onsets,
-        ])  # fmt: skip
+        drive = drive._replace(coefficients=drive.coefficients._replace(has_reversals=True))
+        motion, log = np.empty((OUTPUT_COUNT, drive.base_acc.size)), np.empty((MAX_EVENTS, 4))
+        rows, states = np.empty((periods, len(EXTREME_NAMES))), self._make_states(x[None])
+        for row in rows:
+            start = states[0, U]
+            count = self._advance(states, drive, drive.base_acc.size, motion, log)
+            events = log[: min(count, MAX_EVENTS)]
+            u = np.concatenate([[start], motion[0], events[events[:, 1] == REVERSAL_GUARD, 3]])
+            onsets = [
+                np.count_nonzero((events[:, 1] == side) & (events[:, 2] > 0)) for side in (0, 1)
+            ]
+            forces = motion[3].max(), motion[4].min()
+            row[:] = u.max(), u.min(), motion[2].max(), motion[2].min(), *forces, *onsets
+        return rows
 
-    def sample_motion(
-        self, x: Float1D, frequency_hz: float, acceleration_m_s2: float, periods: int, count: int
-    ) -> Float2D:
+    def sample_motion(self, x: Float1D, periods: int, count: int) -> Float2D:
         each = max(1, math.ceil(SAMPLES_PER_CYCLE * periods / count))
-        drive = self._make_drive(frequency_hz, acceleration_m_s2, each * count, periods)
-        motion = np.empty((OUTPUT_COUNT, each * count))
-        drive.advance(self._make_states(x[None]), 1, motion)
+        drive, motion = (
+            self._make_drive(each * count, periods),
+            np.empty((OUTPUT_COUNT, each * count)),
+        )
+        self._advance(self._make_states(x[None]), drive, each * count, motion, _NO_EVENTS)
         return motion[:, each - 1 :: each]
 
-    def parameter(self, name: str) -> float:
-        return find_parameter(self.model, name)
+    def measure_growth(self, x: Float1D, periods: int) -> tuple[Float1D, Float1D]:
+        """See `PeriodMap`; from a neighbor that is brought back near after each period."""
+        growth, separation = np.empty(periods), np.zeros(self.size)
+        separation[: V + 1] = PERTURBATION_M / math.sqrt(2)
+        for i in range(periods):
+            free, directions = self.free_directions(x)
+            neighbor = x + directions @ separation[free]
+            ends = self._advance_periods(self._make_states(np.array([x, neighbor])), 1)
+            x, difference = ends[0], ends[1] - ends[0]
+            size = max(float(np.linalg.norm(difference)), math.ulp(PERTURBATION_M))
+            growth[i] = math.log(size / PERTURBATION_M)
+            separation = difference * (PERTURBATION_M / size)
+        return growth, x
 
-    def with_parameter(self, name: str, value: float) -> "EventDrivenMap":
-        return EventDrivenMap(change_parameter(self.model, name, value))
+
+def make_period_map(model: Model, frequency_hz: float, acceleration_m_s2: float) -> PeriodMap:
+    """Return the period map of a model at a drive: closed form if effects allow, else event-driven.
+
+    InputError if the model changes with time, or the drive is none.
+    """
+    validate_frequencies([frequency_hz], acceleration_m_s2, 1)
+    model.require_steady_state()
+    kind = ClosedFormMap if model.changes_only_parameters else EventDrivenMap
+    return kind(model, frequency_hz, acceleration_m_s2)
 
 
 def has_dashpot(effect: Effect, constants: tuple[float, ...]) -> bool:

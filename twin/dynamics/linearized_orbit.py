@@ -26,6 +26,7 @@ from twin.model.event_integrator_kernel import (
     U,
     V,
 )
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT, Solver, StateEstimate
 
 # Of the sign of a variation: (state at the end, u in m at the samples).
@@ -78,7 +79,7 @@ class LinearizedOrbit:
         per_period = max(MIN_SAMPLES_PER_PERIOD, 1.1 * model.min_rate_hz / orbit.frequency_hz)
         self._samples = math.ceil(per_period / parts)  # of a part
         self._rate_hz = parts * self._samples * orbit.frequency_hz
-        self._solver: Solver = model.prepare(self._rate_hz)
+        self._solver: Solver = prepare_solver(model, self._rate_hz)
         count = parts * self._samples
         phase = 2.0 * math.pi * np.arange(count + 1) / count
         self._base_acc: Float1D = orbit.acceleration_m_s2 * np.sin(phase)

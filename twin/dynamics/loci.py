@@ -1,6 +1,5 @@
 """Loci of bifurcations in two parameters, such as folds and grazings over frequency and gap."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,8 +13,10 @@ from twin.dynamics.arclength import (
     CurvePoint,
     NoConvergence,
     correct,
+    correct_at_limit,
     next_step,
-    weighted_length,
+    passes,
+    unit_axis,
 )
 from twin.dynamics.bifurcations import (
     Bifurcation,
@@ -122,8 +123,7 @@ def _follow(
     problem = make_problem(start.orbit, *parameters)
     z = np.append(start.orbit.x, problem.start())
     bounds = np.array(limits)
-    axis, weights = np.zeros(z.size), np.ones(z.size)
-    axis[-1] = sign
+    axis, weights = unit_axis(z.size, sign), np.ones(z.size)
     weights[:-2], weights[-2:] = orbit_weights(start.orbit), 10.0 / (bounds[:, 1] - bounds[:, 0])
     system: GrazingProblem | MultiplierProblem
     if start.kind == "grazing":
@@ -158,12 +158,12 @@ def _follow(
             continue
         outside = (new.z[-2:] < bounds[:, 0]) | (new.z[-2:] > bounds[:, 1])
         if outside.any():
-            limited = _at_limit(system, last, new, bounds)
+            limited = correct_at_limit(system.evaluate, last, new, bounds)
             if limited is not None:
                 points.append(limited)
             return finish("range end")
         points.append(new)
-        if len(points) > 5 and _closes(points):
+        if len(points) > 5 and passes(points[0], last, new, points[0].weights):
             points.append(points[0])
             return finish("closed loop")
         step = next_step(step, turn_cos, new.iterations, max_step)
@@ -178,36 +178,3 @@ def _predict(points: list[Point], step: float) -> Float1D:
         length = last.distance(points[-2].z)
         guess = guess + 0.5 * step * step / length * (last.tangent - points[-2].tangent)
     return guess
-
-
-def _at_limit(
-    system: GrazingProblem | MultiplierProblem, last: Point, new: Point, bounds: Float2D
-) -> Point | None:
-    """Return the point at the first limit between two points; None without convergence."""
-    first, which, limit = math.inf, 0, 0.0
-    for index, (low, high) in enumerate(bounds.tolist()):
-        k = index - 2
-        edge = low if new.z[k] < low else high
-        fraction = (edge - last.z[k]) / (new.z[k] - last.z[k]) if new.z[k] != last.z[k] else 2.0
-        if 0.0 <= fraction < first:
-            first, which, limit = fraction, k, edge
-    guess = last.z + first * (new.z - last.z)
-    guess[which] = limit
-    axis = np.zeros(guess.size)
-    axis[which] = math.copysign(1.0, new.z[which] - last.z[which]) / last.weights[which]
-    try:
-        return correct(system.evaluate, guess, axis, last.weights)
-    except NoConvergence:
-        return None
-
-
-def _closes(points: list[Point]) -> bool:
-    """Return whether the locus has passed its start in its last step."""
-    start, last, new = points[0], points[-2], points[-1]
-    weights = start.weights
-    chord, offset = (new.z - last.z) * weights, (start.z - last.z) * weights
-    length = weighted_length(new.z - last.z, weights)
-    along = float(offset @ chord) / length
-    across = math.sqrt(max(float(offset @ offset) - along * along, 0.0))
-    same_way = float((start.tangent * weights) @ chord) > 0.8 * length
-    return 0 < along <= length and across < 0.1 * length and same_way

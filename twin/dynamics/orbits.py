@@ -4,7 +4,6 @@ An orbit is a zero of P^n(x; parameters) - x. `OrbitProblem` is that equation fo
 """
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -28,6 +27,8 @@ MIN_FREQUENCY_RATIO = 0.02  # of an iterate to the start: a long period costs mu
 PENETRATION_TOL_M = 1e-7  # m: of sampled motion, whose drive is linear between samples
 RETURN_TOL = 1e-3  # of the travel: error of the same sampled motion after an orbit
 SAMPLES_PER_PERIOD = 2000
+SAME_ORBIT = 1e-5  # of the size: distance of two orbits that are the same
+MAX_ORBIT_DISTANCE = 0.1  # of the size: from a motion to the orbit that attracts it
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +40,6 @@ class Orbit:
     """
 
     period_map: PeriodMap
-    frequency_hz: float
-    acceleration_m_s2: float
     periods: int
     x: Float1D
     jacobian: Float2D
@@ -48,15 +47,26 @@ class Orbit:
     contacts: tuple[int, ...]
 
     @property
+    def frequency_hz(self) -> float:
+        return self.period_map.frequency_hz
+
+    @property
+    def acceleration_m_s2(self) -> float:
+        return self.period_map.acceleration_m_s2
+
+    @property
     def stable(self) -> bool:
         return bool(abs(self.multipliers[0]) < 1)
+
+    @property
+    def size_m(self) -> float:
+        """Largest coordinate in m, at least 1e-12 m."""
+        return max(motion_size(self.x, self.period_map.scales), 1e-12)
 
     @cached_property
     def extremes(self) -> Float1D:
         """Extremes over the orbit, (8,), `stepped_sine.EXTREME_NAMES`; sums of the onsets."""
-        return self.period_map.find_extremes(
-            self.x, self.frequency_hz, self.acceleration_m_s2, self.periods
-        )
+        return self.period_map.find_extremes(self.x, self.periods)
 
     def extreme(self, name: str) -> float:
         """Return one of `EXTREME_NAMES`."""
@@ -70,23 +80,38 @@ class Orbit:
     def u_min(self) -> float:
         return self.extreme("u_min")
 
+    @cached_property
+    def phases(self) -> Float2D:
+        """Coordinates at each period of the drive, from x on, (periods, n)."""
+        return np.array([self.x, *self.period_map.record(self.x, self.periods)[:-1]])
+
     def sample_motion(self, count: int) -> Float2D:
         """Return (7, count) samples of the orbit, `closed_form.OUTPUT_NAMES`."""
-        return self.period_map.sample_motion(
-            self.x, self.frequency_hz, self.acceleration_m_s2, self.periods, count
-        )
+        return self.period_map.sample_motion(self.x, self.periods, count)
 
     def is_admissible(self) -> bool:
         """Check densely sampled motion: it returns, no mass inside a bumper, no bumper pulls."""
         parameters = self.period_map.model.parameters
         u, _, _, f_r, f_l, u_r, u_l = self.sample_motion(SAMPLES_PER_PERIOD * self.periods)
         clearance = min((parameters.gap_r + u_r - u).min(), (u - u_l + parameters.gap_l).min())
-        start = self.x[0]
         tolerance = PENETRATION_TOL_M + RETURN_TOL * float(np.ptp(u))
-        returns = abs(u[-1] - start) < tolerance * max(1.0, abs(self.multipliers[0]))
+        returns = abs(u[-1] - self.x[0]) < tolerance * max(1.0, abs(self.multipliers[0]))
         return bool(
             returns and clearance > -PENETRATION_TOL_M and f_r.min() >= 0 and f_l.max() <= 0
         )
+
+    def is_same(self, other: "Orbit") -> bool:
+        """Return whether an orbit at the same parameters is this one, up to whole periods."""
+        limit = SAME_ORBIT * max(self.size_m, other.size_m)
+        return self.periods == other.periods and self.passes(other.x, limit)
+
+    def passes(self, x: Float1D, limit_m: float) -> bool:
+        """Return whether a phase of the orbit lies within `limit_m` of x."""
+        return self.distance(x) < limit_m
+
+    def distance(self, x: Float1D) -> float:
+        """Return the distance in m of x from the nearest phase."""
+        return float((np.abs(self.phases - x) / self.period_map.scales).max(axis=1).min())
 
 
 def floquet_multipliers(jacobian: Float2D) -> Complex1D:
@@ -111,65 +136,45 @@ class OrbitProblem:
     differences.
     """
 
-    def __init__(
-        self,
-        period_map: PeriodMap,
-        frequency_hz: float,
-        acceleration_m_s2: float,
-        periods: int,
-        names: Sequence[str],
-    ) -> None:
-        self.names, self.periods, self.size = tuple(names), periods, period_map.size
+    def __init__(self, period_map: PeriodMap, periods: int, *names: str) -> None:
+        self.names, self.periods, self.size = names, periods, period_map.size
         self.scales, self._identity = period_map.scales, np.eye(self.size)
-        self._frequency_hz, self._level = frequency_hz, acceleration_m_s2
-        self._map, self._maps = period_map, (tuple[float, ...](), period_map)
-        self._columns = [find_columns(period_map, name) for name in self.names]
-        for name in self.names:
-            if name not in (FREQUENCY, LEVEL):
-                period_map.parameter(name)  # refuses unknown names
+        self._map = period_map
+        self._varied: tuple[tuple[float, ...], PeriodMap] = ((), period_map)
+        self.start()  # refuses unknown names
+        self._columns = [find_columns(period_map, name) for name in names]
 
     def start(self) -> Float1D:
         """Return the values of the parameters as given."""
-        return np.array([
-            {FREQUENCY: self._frequency_hz, LEVEL: self._level}[name]
-            if name in (FREQUENCY, LEVEL)
-            else self._map.parameter(name)
-            for name in self.names
-        ])  # fmt: skip
+        return np.array([self._map.parameter(name) for name in self.names])
 
-    def at(self, values: Sequence[float]) -> tuple[PeriodMap, float, float]:
-        """Return (map, frequency in Hz, level in m/s2) at these values of the parameters."""
-        frequency_hz, level = self._frequency_hz, self._level
-        key: tuple[float, ...] = ()
+    def at(self, *values: float) -> PeriodMap:
+        """Return the map at these values of the parameters."""
+        named = dict(zip(self.names, values, strict=True))
+        drive = {name: named.pop(name) for name in (FREQUENCY, LEVEL) if name in named}
         period_map = self._map
-        for name, value in zip(self.names, values, strict=True):
-            if name == FREQUENCY:
-                frequency_hz = value
-            elif name == LEVEL:
-                level = value
-            else:
-                key = (*key, value)
-        if key:
-            if self._maps[0] != key:
-                for name, value in zip(self.names, values, strict=True):
-                    if name not in (FREQUENCY, LEVEL):
-                        period_map = period_map.with_parameter(name, value)
-                self._maps = key, period_map
-            period_map = self._maps[1]
-        return period_map, frequency_hz, level
+        if named:
+            key = tuple(named.values())
+            if self._varied[0] != key:
+                for name, value in named.items():
+                    period_map = period_map.with_parameter(name, value)
+                self._varied = key, period_map
+            period_map = self._varied[1]
+        for name, value in drive.items():
+            period_map = period_map.with_parameter(name, value)
+        return period_map
 
     def map_result(self, z: Float1D) -> MapResult:
         """Return the map's result at z; NaN where the parameters are out of range."""
         n = self.size
-        values = z[n:].tolist()
         try:
-            period_map, frequency_hz, level = self.at(values)
+            period_map = self.at(*z[n:].tolist())
         except InputError:
-            frequency_hz = math.nan
-        least_hz = MIN_FREQUENCY_RATIO * self._frequency_hz
-        if not least_hz < frequency_hz < math.inf or period_map.size != n:
             return _undefined_result(n)
-        return period_map.evaluate(z[:n], frequency_hz, level, self.periods)
+        least_hz = MIN_FREQUENCY_RATIO * self._map.frequency_hz
+        if not least_hz < period_map.frequency_hz < math.inf or period_map.size != n:
+            return _undefined_result(n)
+        return period_map.evaluate(z[:n], self.periods)
 
     def evaluate(self, z: Float1D) -> Evaluation:
         """Return residual and Jacobian at z."""
@@ -217,11 +222,8 @@ class OrbitProblem:
         """Return the orbit at a zero z of the equation."""
         if multipliers is None:
             multipliers = floquet_multipliers(result.jacobian)
-        period_map, frequency_hz, level = self.at(z[self.size :].tolist())
-        return Orbit(
-            period_map, frequency_hz, level, self.periods, z[: self.size], result.jacobian,
-            multipliers, result.contacts,
-        )  # fmt: skip
+        period_map, x = self.at(*z[self.size :].tolist()), z[: self.size]
+        return Orbit(period_map, self.periods, x, result.jacobian, multipliers, result.contacts)
 
 
 def difference_step(value: float) -> float:
@@ -250,16 +252,9 @@ def _undefined_result(n: int) -> MapResult:
     return MapResult(nan[0], nan, np.full((n, 4), math.nan), (0,), np.empty((0, n + 7)))
 
 
-def find_orbit(
-    period_map: PeriodMap,
-    frequency_hz: float,
-    acceleration_m_s2: float,
-    guess: Float1D,
-    periods: int = 1,
-) -> Orbit | None:
+def find_orbit(period_map: PeriodMap, guess: Float1D, periods: int = 1) -> Orbit | None:
     """Return the orbit, stable or not, to which Newton's method leads from x = guess, or None."""
-    problem = OrbitProblem(period_map, frequency_hz, acceleration_m_s2, periods, ())
-    x = guess
+    problem, x = OrbitProblem(period_map, periods), guess
     for _ in range(MAX_NEWTON_STEPS):
         residual, jacobian, result = problem.evaluate(x)
         if not np.isfinite(residual).all():
@@ -280,15 +275,34 @@ def motion_size(x: Float1D, scales: Float1D) -> float:
     return float(np.abs(x / scales).max())
 
 
+def reduce_period(orbit: Orbit) -> Orbit:
+    """Return an orbit with its least period; itself if that is what it has."""
+    scales, limit = (
+        orbit.period_map.scales,
+        SAME_ORBIT * motion_size(orbit.x, orbit.period_map.scales),
+    )
+    for periods in range(1, orbit.periods // 2 + 1):
+        returned = motion_size(orbit.phases[periods] - orbit.x, scales)
+        if orbit.periods % periods == 0 and returned < limit:
+            return find_orbit(orbit.period_map, orbit.x, periods) or orbit
+    return orbit
+
+
+def find_attracting_orbit(
+    period_map: PeriodMap, x: Float1D, periods: int, size_m: float
+) -> Orbit | None:
+    """Return the stable orbit near x of a motion of this size, with its least period, or None."""
+    orbit = find_orbit(period_map, x, periods)
+    if orbit is None or not orbit.stable:
+        return None
+    is_near = motion_size(orbit.x - x, period_map.scales) < MAX_ORBIT_DISTANCE * size_m
+    return reduce_period(orbit) if is_near else None
+
+
 def settle_to_orbit(
-    period_map: PeriodMap,
-    frequency_hz: float,
-    acceleration_m_s2: float,
-    start: Float1D | None = None,
-    periods: int = 1,
+    period_map: PeriodMap, start: Float1D | None = None, periods: int = 1
 ) -> Orbit | None:
     """Return the stable orbit to which x = start (or rest) settles, or None."""
-    x = period_map.rest() if start is None else start
-    x = period_map.iterate(x, frequency_hz, acceleration_m_s2, SETTLING_PERIODS)
-    orbit = find_orbit(period_map, frequency_hz, acceleration_m_s2, x, periods)
+    x = period_map.iterate(period_map.rest() if start is None else start, SETTLING_PERIODS)
+    orbit = find_orbit(period_map, x, periods)
     return orbit if orbit is not None and orbit.stable else None

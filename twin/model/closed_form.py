@@ -12,12 +12,13 @@ There is no other memory: results are bit-identical for any division of the samp
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import NamedTuple
 
 import numpy as np
+from numba import float64, int64, types
 
 from table_io.block import Float1D, Float2D
-from twin.model.closed_form_kernel import advance_samples
+from table_io.compilation import jit_helper, jit_kernel
 from twin.model.contact_regime import (
     BASE,
     C_L,
@@ -28,6 +29,8 @@ from twin.model.contact_regime import (
     E_R,
     G_L,
     G_R,
+    IMPULSE_L,
+    IMPULSE_R,
     K_L,
     K_R,
     MASS,
@@ -41,15 +44,19 @@ from twin.model.contact_regime import (
     SUBSTEPS,
     U_L,
     U_R,
+    Segment,
     U,
     V,
+    advance_through_events,
+    bumper_forces,
+    contact_mode,
+    flush_denormal,
+    take_step,
     transition_matrix,
-)  # fmt: skip
+)
+from twin.model.model import Model
 from twin.model.parameters import Parameters
-from twin.model.solver import StateEstimate
-
-if TYPE_CHECKING:
-    from twin.model.model import Model
+from twin.model.solver import OUTPUT_COUNT, StateEstimate
 
 OUTPUT_NAMES = ("u", "v", "a", "f_r", "f_l", "u_r", "u_l")
 EVENT_COLUMNS = ("time_s", "side", "onset", "closing_speed", "impulse")
@@ -62,12 +69,12 @@ _EMPTY_EVENTS = np.empty((0, len(EVENT_COLUMNS)))
 class ClosedFormSolver:
     """Closed-form solver of a model at one sampling rate."""
 
-    model: "Model"
+    model: Model
     parameters: Parameters
     params: Float1D
 
     @classmethod
-    def from_model(cls, model: "Model", rate_hz: float) -> "ClosedFormSolver":
+    def from_model(cls, model: Model, rate_hz: float) -> "ClosedFormSolver":
         return cls(model, model.parameters, discretized_params(model.parameters, rate_hz))
 
     def rest_state(self, index: int = 0) -> Float1D:
@@ -76,9 +83,8 @@ class ClosedFormSolver:
     def restart_state(self, start: StateEstimate) -> Float1D:
         added = self.model.added_acceleration(start.table_disp)
         return restart_state(
-            start.u, start.v, start.u_r, start.u_l, start.contact_r, start.contact_l,
-            start.base_acc + (0.0 if added is None else added), self.parameters,
-        )  # fmt: skip
+            start, start.base_acc + (0.0 if added is None else added), self.parameters
+        )
 
     def set_clock(self, state: Float1D, samples: float) -> None:
         pass
@@ -118,23 +124,14 @@ def continuous_params(parameters: Parameters) -> Float1D:
     """Return the step-independent part of `discretized_params`, (PARAMS_SIZE,)."""
     p = parameters
     params = np.zeros(PARAMS_SIZE)
-    kr, cr, kl, cl = (
-        p.bumper_stiffness_r,
-        p.bumper_damping_r,
-        p.bumper_stiffness_l,
-        p.bumper_damping_l,
-    )
+    kr, kl = p.bumper_stiffness_r, p.bumper_stiffness_l
+    cr, cl = p.bumper_damping_r, p.bumper_damping_l
     params[MASS] = p.mass
     # A face without a dashpot is released at u_j = 0, where it stays: it has no relaxation rate.
     params[R_R], params[R_L] = kr / cr if cr > 0 else 0.0, kl / cl if cl > 0 else 0.0
-    params[K_R], params[K_L], params[C_R], params[C_L], params[G_R], params[G_L] = (
-        kr,
-        kl,
-        cr,
-        cl,
-        p.gap_r,
-        p.gap_l,
-    )
+    params[K_R : K_L + 1] = kr, kl
+    params[C_R : C_L + 1] = cr, cl
+    params[G_R : G_L + 1] = p.gap_r, p.gap_l
     for mode in range(4):
         right, left = mode & 1, mode >> 1
         k = p.stiffness + right * kr + left * kl
@@ -175,55 +172,148 @@ def discretized_params(parameters: Parameters, rate_hz: float) -> Float1D:
     return params
 
 
-def advance_state(state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D) -> None:
-    """Advance `state` in place from its sample through the next n samples.
+class EventLog(NamedTuple):
+    """Contact events (m, 5), `EVENT_COLUMNS`, and the step in progress: its start in s, and A."""
+
+    events: Float2D
+    start: float
+    base: float
+    slope: float
+
+
+@jit_helper()
+def add_impulses(
+    state: Float1D, params: Float1D, mode: int, t: float, du: float, dv: float, base: float
+) -> None:
+    """Add the impulses of F_R, F_L over t s of contact, exact by momentum; `base` is the mean A."""
+    b = MODES + mode * MODE_SIZE
+    integral_u = (params[b + 2] * t - params[MASS] * (dv + base * t) - params[b + 1] * du) / params[
+        b
+    ]
+    if mode & 1:
+        state[IMPULSE_R] += params[C_R] * du + params[K_R] * (integral_u - params[G_R] * t)
+    if mode & 2:
+        state[IMPULSE_L] += params[C_L] * du + params[K_L] * (integral_u + params[G_L] * t)
+
+
+@jit_helper()
+def log_segment(
+    log: EventLog, count: int, state: Float1D, params: Float1D, segment: Segment
+) -> int:
+    """Add impulses over a segment and write its event, if it fits; return the number of events."""
+    events, start, base, slope = log
+    mode, t, dt, side, _, _, x0, x1 = segment
+    if mode:
+        mean_acc = base + slope * t + 0.5 * slope * dt
+        add_impulses(state, params, mode, dt, x1[0] - x0[0], x1[1] - x0[1], mean_acc)
+    if side < 0:
+        return count
+    sign, onset = 1.0 - 2.0 * side, state[CONTACT_R + side]
+    if count < events.shape[0]:
+        closing_speed = sign * (state[V] + params[R_R + side] * state[U_R + side])
+        events[count, 0] = start + (t + dt)
+        events[count, 1] = sign
+        events[count, 2] = onset
+        events[count, 3] = closing_speed * onset
+        events[count, 4] = state[IMPULSE_R + side]
+    state[IMPULSE_R + side] = 0.0
+    return count + 1
+
+
+# One signature, so that slices and read-only arrays of Blocks need no further compilation.
+_READ = types.Array(float64, 1, "A", readonly=True)
+_WRITE = types.Array(float64, 2, "A")
+
+
+@jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE), cache=True)
+def advance_samples(
+    state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D
+) -> int:
+    """Advance `state` through the samples of A in m/s2, (n,), linear between; return the events.
+
+    out (7, n), events (m, 5) and their number as in `advance_state`. A step whose guards may
+    have turned negative (or are NaN) is repeated through its events.
+    """
+    if state.size < STATE_SIZE or out.shape[0] < OUTPUT_COUNT or out.shape[1] < base_acc.size:
+        raise ValueError("state or out is too small for these samples; see advance_state")
+    h, substeps, mass, count = params[STEP], int(params[SUBSTEPS]), params[MASS], 0
+    u, v, ur, ul, base = state[U], state[V], state[U_R], state[U_L], state[BASE]
+    mode = contact_mode(state)
+    for i in range(base_acc.size * substeps):
+        sample, substep = i // substeps, i % substeps
+        slope = (base_acc[sample] - base) / (h * (substeps - substep))
+        next_base = base + slope * h if substep + 1 < substeps else base_acc[sample]
+        b = MODES + mode * MODE_SIZE
+        k, c = params[b], params[b + 1]
+        q1 = -mass * slope / k
+        q0 = (params[b + 2] - mass * base - c * q1) / k
+        departure, particular = (u - q0, v - q1), (q0 + q1 * h, q1)
+        step = take_step(params, mode, h, (u, v, ur, ul), departure, particular, (base, next_base))
+        if step.is_clear:
+            if mode:
+                mean_acc = 0.5 * (base + next_base)
+                add_impulses(state, params, mode, h, step.u - u, step.v - v, mean_acc)
+            u, v, ur, ul = step.u, step.v, flush_denormal(step.u_r), flush_denormal(step.u_l)
+        else:
+            state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
+            log = EventLog(events, i * h, base, slope)
+            count = advance_through_events(
+                state, params, h, base, slope, (0.0, 0.0, 0.0), log_segment, log, count
+            )
+            if not abs(state[U]) + abs(state[U_R]) + abs(state[U_L]) < math.inf:
+                state[:] = math.nan
+            u, v, ur, ul = state[U], state[V], state[U_R], state[U_L]
+            mode = contact_mode(state)
+            next_base += state[BASE] - base  # propagates NaN
+        base = next_base
+        if substep + 1 == substeps:
+            b = MODES + mode * MODE_SIZE
+            out[0, sample], out[1, sample] = u, v
+            out[2, sample] = (params[b + 2] - params[b + 1] * v - params[b] * u) / mass
+            flight_force = state[BASE] - state[BASE]  # 0, or NaN once the state is NaN
+            out[3, sample], out[4, sample] = bumper_forces(params, mode, v, ur, ul, flight_force)
+            out[5, sample], out[6, sample] = ur, ul
+    state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
+    return count
+
+
+def advance_state(
+    state: Float1D,
+    params: Float1D,
+    base_acc: Float1D,
+    out: Float2D,
+    events: Float2D = _EMPTY_EVENTS,
+) -> int:
+    """Advance `state` in place from its sample through the next n samples; return the events.
 
     base_acc: table acceleration at these n samples in m/s2, (n,). out (7, n), `OUTPUT_NAMES`: u in
     m, v in m/s, total acceleration in m/s2, F_R >= 0 and F_L <= 0 in N, u_R and u_L in m.
-    After a NaN in the input, out and the state are NaN until a restart.
+    events (m, 5), `EVENT_COLUMNS`: time in s since the sample where the call began; side +1 right,
+    -1 left; onset 1 or release 0; closing speed relative to the bumper's face in m/s, at onsets;
+    impulse of the contact in N s (right >= 0, left <= 0), at releases. Those beyond m are counted,
+    not written. After a NaN in the input, out and the state are NaN until a restart.
     """
-    advance_samples(state, params, base_acc, out, _EMPTY_EVENTS)
+    return advance_samples(state, params, base_acc, out, events)
 
 
-def advance_state_logged(
-    state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D
-) -> int:
-    """Advance as `advance_state`, log contact events to `events` (m, 5) and return their number.
-
-    `EVENT_COLUMNS`: time in s since the sample where the call began; side +1 right, -1 left; onset
-    1 or release 0; closing speed relative to the bumper's face in m/s, at onsets; impulse of the
-    contact in N s (right >= 0, left <= 0), at releases. Events beyond m are counted, not written.
-    """
-    return int(advance_samples(state, params, base_acc, out, events))
-
-
-def restart_state(
-    u: float,
-    v: float,
-    u_r: float,
-    u_l: float,
-    force_r_contact: bool,
-    force_l_contact: bool,
-    base_acc: float,
-    parameters: Parameters,
-) -> Float1D:
-    """Return a consistent model state from a measured estimate (SI, right positive, base_acc = A).
+def restart_state(start: StateEstimate, base_acc: float, parameters: Parameters) -> Float1D:
+    """Return a consistent model state from a measured one; the mass feels `base_acc` = A in m/s2.
 
     In contact u_j follows u. A contact that would pull becomes flight from the touching point, one
     on an uncompressed bumper becomes flight; a flight that penetrates becomes touching. All NaN if
     any input is.
     """
-    p = parameters
-    if math.isnan(u + v + u_r + u_l + base_acc):
+    p, u, v = parameters, start.u, start.v
+    if math.isnan(u + v + start.u_r + start.u_l + base_acc):
         return np.full(STATE_SIZE, np.nan)
     state = np.zeros(STATE_SIZE)
     state[U], state[V], state[BASE] = u, v, base_acc
     # The left side is mirrored, so that both are evaluated with right-hand signs.
     state[U_R], state[CONTACT_R] = _bumper_state(
-        u - p.gap_r, v, u_r, force_r_contact, p.bumper_stiffness_r, p.bumper_damping_r
+        u - p.gap_r, v, start.u_r, start.contact_r, p.bumper_stiffness_r, p.bumper_damping_r
     )
     mirrored_u_l, state[CONTACT_L] = _bumper_state(
-        -u - p.gap_l, -v, -u_l, force_l_contact, p.bumper_stiffness_l, p.bumper_damping_l
+        -u - p.gap_l, -v, -start.u_l, start.contact_l, p.bumper_stiffness_l, p.bumper_damping_l
     )
     state[U_L] = -mirrored_u_l
     return state

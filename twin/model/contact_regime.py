@@ -9,9 +9,12 @@ event times need root finding. A guard is a quantity that stays positive until i
 """
 
 import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from table_io.block import Float1D
 from table_io.compilation import jit_helper
+from twin.model.event_location import Accuracy, find_root, locate_event
 
 Sinusoid = tuple[float, float, float]  # peak in m/s2, angular frequency in 1/s, phase in rad
 # Returned by `mode_solution`.
@@ -19,7 +22,8 @@ ModeSolution = tuple[float, float, float, float, float, float, Sinusoid, float, 
 Kinematics = tuple[float, float, float, float]  # u, u', u'', u'''
 Quantity = tuple[float, float, float, float, float]  # q = q0 + qu u + qv u' + qj exp(-r t)
 Motion = tuple[float, float, float]  # u, u', u''
-# u_j at the end of a step; the guard at its start and end; the guard's slope there
+Departure = tuple[float, float]  # u and u' of the homogeneous part of a motion
+# u_j at the end of a step; a guard at its start and end; its slope there
 StepGuard = tuple[float, float, float, float, float]
 
 # Indices of `state`
@@ -31,9 +35,51 @@ MASS, K_R, K_L, C_R, C_L, G_R, G_L, STEP, SUBSTEPS, R_R, R_L, E_R, E_L, MODES = 
 MODE_SIZE = 9
 PARAMS_SIZE = MODES + 4 * MODE_SIZE
 
+
+class Segment(NamedTuple):
+    """Motion in one mode up to an event on `side` (0 right, 1 left, -1 none), dt s long.
+
+    `begin` in s since the start of the step; `faces`: u_r and u_l in m there; x0, x1: the motion at
+    both ends.
+    """
+
+    mode: int
+    begin: float
+    dt: float
+    side: int
+    faces: tuple[float, float]
+    solution: ModeSolution
+    x0: Kinematics
+    x1: Kinematics
+
+
+class Step(NamedTuple):
+    """A step in one mode, if no guard has turned negative within it (`is_clear`).
+
+    u, v, u_r, u_l and total acceleration `a` at its end; u'' at both ends; guards of right and
+    left as `StepGuard`.
+    """
+
+    u: float
+    v: float
+    u_r: float
+    u_l: float
+    a: float
+    d0: float
+    d1: float
+    right: StepGuard
+    left: StepGuard
+    is_clear: bool
+
+
+# (what is recorded, its count, state at the end, parameters, segment) -> count
+Observer = Callable[[Any, int, Float1D, Float1D, Segment], int]
+
 PENETRATION_TOL_M = 1e-14  # m: smaller penetrations are rounding errors
 DENORMAL_LIMIT = 1e-30  # m: smaller bumper deformations are set to zero
 MAX_EVENTS_PER_STEP = 40  # only rounding at a grazing contact can come near it
+# The square of the last Newton step is below float resolution, in time or in the value there.
+ACCURACY = Accuracy(value_tolerance=1e-8, slope_tolerance=1e-6, is_analytic=True)
 
 
 @jit_helper()
@@ -100,7 +146,7 @@ def solution_at(t: float, m: ModeSolution) -> Kinematics:
     return u, v, d, j
 
 
-@jit_helper()
+@jit_helper(inlined=True)
 def evaluate_quantity(t: float, x: Kinematics, q: Quantity) -> tuple[float, float, float]:
     """Return (q, q', q'') at t s, where the motion is x."""
     u, v, d, j = x
@@ -136,7 +182,7 @@ def bumper_forces(
     )
 
 
-@jit_helper()
+@jit_helper(inlined=True)
 def step_guard(
     params: Float1D, mode: int, side: int, x0: Motion, x1: Motion, uj: float
 ) -> StepGuard:
@@ -156,84 +202,64 @@ def step_guard(
     return uj1, gap + u - uj, gap + u1 - uj1, v + r * uj, v1 + r * uj1
 
 
-@jit_helper()
-def stays_positive(h: float, g0: float, g1: float, s0: float, s1: float) -> bool:
-    """Return False if a guard g with slope s at both ends of a step of h s may turn negative.
+@jit_helper(inlined=True)
+def stays_positive(h: float, guard: StepGuard) -> bool:
+    """Return False if a guard may turn negative within a step of h s.
 
     Within a substep the slope changes sign at most once, so it hides a minimum only from - to +,
     and not if the guard begins high enough. False for NaN.
     """
+    _, g0, g1, s0, s1 = guard
     return g1 >= 0 and (s0 >= 0 or s1 <= 0 or g0 > -2 * h * s0)
 
 
-@jit_helper()
+@jit_helper(inlined=True)
 def flush_denormal(uj: float) -> float:
     """Return a bumper deformation in m, 0 if it is below DENORMAL_LIMIT."""
     return uj if abs(uj) > DENORMAL_LIMIT else 0.0
 
 
-@jit_helper()
-def find_root(
-    lo: float, hi: float, start: float, sign: float, m: ModeSolution, q: Quantity, order: int
-) -> float:
-    """Return the time in s in [lo, hi] at which q (order 0) or q' (order 1) changes to `sign`.
+@jit_helper(inlined=True)
+def take_step(
+    params: Float1D,
+    mode: int,
+    h: float,
+    x: tuple[float, float, float, float],
+    departure: Departure,
+    particular: tuple[float, float],
+    base: tuple[float, float],
+) -> Step:
+    """Return the step over h s of the discretized parameters from x = (u, v, u_r, u_l).
 
-    Bracketed Newton iteration from `start`. It has converged when the square of a Newton step is
-    below float resolution in time (order 0) or in the value there (order 1, an extremum); a short
-    bisection step is no sign of convergence.
+    departure: u and u' of the homogeneous part at the start; particular: those of the particular
+    part at the end; base: A in m/s2 at both ends.
     """
-    tolerance = (1e-6 if order else 1e-8) * hi
-    t = start if lo < start < hi else hi
-    for _ in range(80):
-        values = evaluate_quantity(t, solution_at(t, m), q)
-        f, df = values[order], values[order + 1]
-        if f * sign > 0:
-            hi = t
-        else:
-            lo = t
-        new = t - f / df if df != 0.0 else lo
-        if df != 0.0 and abs(new - t) <= tolerance:
-            return min(max(new, lo), hi)
-        if not lo < new < hi:
-            new = 0.5 * (lo + hi)
-            if not lo < new < hi:
-                break
-        t = new
-    return t
+    b, mass = MODES + mode * MODE_SIZE, params[MASS]
+    k, c, f0 = params[b], params[b + 1], params[b + 2]
+    u, v, ur, ul = x
+    y, z = departure
+    u1 = particular[0] + params[b + 5] * y + params[b + 6] * z
+    v1 = particular[1] + params[b + 7] * y + params[b + 8] * z
+    a1 = (f0 - c * v1 - k * u1) / mass
+    d0, d1 = (f0 - c * v - k * u) / mass - base[0], a1 - base[1]
+    right = step_guard(params, mode, 0, (u, v, d0), (u1, v1, d1), ur)
+    left = step_guard(params, mode, 1, (u, v, d0), (u1, v1, d1), ul)
+    is_clear = stays_positive(h, right) and stays_positive(h, left)
+    return Step(u1, v1, right[0], left[0], a1, d0, d1, right, left, is_clear)
 
 
-@jit_helper()
-def contact_event_time(
-    h: float, m: ModeSolution, q: Quantity, x0: Kinematics, x1: Kinematics
+@jit_helper(inlined=True)
+def evaluate_motion(t: float, m: ModeSolution, q: Quantity) -> tuple[float, float, float]:
+    """Return (q, q', q'') at t s of a mode solution."""
+    return evaluate_quantity(t, solution_at(t, m), q)
+
+
+@jit_helper(inlined=True)
+def find_extremum(
+    lo: float, hi: float, start: float, sign: float, m: ModeSolution, q: Quantity
 ) -> float:
-    """Return the first time in s in [0, h] at which the guard q turns negative, else inf.
-
-    x0 and x1: motion at both ends.
-    """
-    g0, d0, _ = evaluate_quantity(0.0, x0, q)
-    g1, d1, _ = evaluate_quantity(h, x1, q)
-    tolerance = PENETRATION_TOL_M * abs(q[1])
-    hi = h
-    if not (g1 < -tolerance or (g1 < 0 and d1 < 0)):
-        if not (d0 < 0 < d1) or g0 > -2 * h * d0:
-            return math.inf
-        hi = find_root(0.0, h, h * d0 / (d0 - d1), 1.0, m, q, 1)
-        if not evaluate_quantity(hi, solution_at(hi, m), q)[0] < -tolerance:
-            return math.inf
-    if g0 > 0:
-        curvature = (g1 - g0 - d0 * h) / (h * h)
-        # The nearer root of the parabola; without a discriminant, or where d0 rounds it off, hi.
-        discriminant = d0 * d0 - 4 * curvature * g0
-        divisor = math.sqrt(discriminant) - d0 if discriminant > 0 else 0.0
-        start = 2 * g0 / divisor if divisor != 0.0 else hi
-        return find_root(0.0, hi, start, -1.0, m, q, 0)
-    # Just after an event the guard starts at zero, rounded either way: find where it is positive.
-    lo = hi
-    for _ in range(60):
-        lo *= 0.5
-        if evaluate_quantity(lo, solution_at(lo, m), q)[0] > tolerance:
-            return find_root(lo, 2 * lo, 2 * lo, -1.0, m, q, 0)
-    return 0.0
+    """Return the time in s in [lo, hi] at which the slope of q changes to `sign`, from `start`."""
+    return find_root(lo, hi, start, sign, 0.0, 1, ACCURACY, evaluate_motion, m, q)
 
 
 @jit_helper()
@@ -256,8 +282,12 @@ def advance_to_event(
     x1 = solution_at(h, m)
     dt, side = h, -1
     for s in range(2 if search else 0):
-        event_time = contact_event_time(
-            h, m, contact_guard(params, mode, s, state[U_R + s]), x0, x1
+        q = contact_guard(params, mode, s, state[U_R + s])
+        g0, d0, _ = evaluate_quantity(0.0, x0, q)
+        g1, d1, _ = evaluate_quantity(h, x1, q)
+        tolerance = PENETRATION_TOL_M * abs(q[1])
+        event_time = locate_event(
+            h, (g0, d0), (g1, d1), tolerance, True, ACCURACY, evaluate_motion, m, q
         )
         if event_time < dt or (side < 0 and event_time == dt):
             dt, side = event_time, s
@@ -274,3 +304,39 @@ def advance_to_event(
             if abs(state[U_R + s]) < DENORMAL_LIMIT:
                 state[U_R + s] = 0.0
     return dt, side, m, x0, x1
+
+
+@jit_helper()
+def advance_through_events(
+    state: Float1D,
+    params: Float1D,
+    h: float,
+    base: float,
+    slope: float,
+    wave: Sinusoid,
+    observe: Observer,
+    record: Any,
+    count: int,
+) -> int:
+    """Advance `state` over h s and its events under A = base + slope t + wave; return the count.
+
+    `observe` is called after each segment and returns the `count` of what it records.
+    """
+    peak, w, phase = wave
+    t = 0.0
+    for attempt in range(MAX_EVENTS_PER_STEP):
+        mode, faces = contact_mode(state), (state[U_R], state[U_L])
+        dt, side, m, x0, x1 = advance_to_event(
+            state,
+            params,
+            h - t,
+            base + slope * t,
+            slope,
+            (peak, w, phase + w * t),
+            attempt + 1 < MAX_EVENTS_PER_STEP,
+        )
+        count = observe(record, count, state, params, Segment(mode, t, dt, side, faces, m, x0, x1))
+        t += dt
+        if side < 0:
+            break
+    return count

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy.linalg import expm
@@ -17,13 +17,12 @@ from twin.model.added_laws import compile_laws, pack_constants
 from twin.model.event_integrator_kernel import (
     CLOCK,
     DIRECTION,
+    LINEAR_SIZE,
     STATE_BASE,
     STATE_F,
     STATE_SIZE,
-    build_laws_kernel,
-    integrate_samples,
+    build_kernel,
 )
-from twin.model.event_location import LINEAR_SIZE
 from twin.model.force_laws import (
     NO_STATES,
     NO_WALL_M,
@@ -34,11 +33,9 @@ from twin.model.force_laws import (
     cubic_force,
     hardening_force,
 )
+from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.solver import StateEstimate
-
-if TYPE_CHECKING:
-    from twin.model.model import Model
 
 MAX_PHASE_STEP_RAD = 0.5  # rad per substep in the fastest mode
 MAX_RELAXATIONS = 0.6  # relaxation times per substep, where it is integrated
@@ -47,24 +44,25 @@ MAX_SUBSTEPS = 500
 HARDENING_DEPTH_M = 0.003  # m: compression at which the stiffness of a hardening bumper is taken
 MIN_BOUND_M, MAX_EQUILIBRIUM_M = 1e-3, 10.0  # m: range searched for a static equilibrium
 
+_NO_EVENTS = np.empty((0, 4))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EventDrivenSolver:
     """Event-driven solver of a model at one sampling rate; `parameters` at sample 0."""
 
-    model: "Model"
+    model: Model
     parameters: Parameters
     coefficients: Coefficients
     propagators: Float2D
     laws: AddedLaws | None
 
     @classmethod
-    def from_model(cls, model: "Model", rate_hz: float) -> "EventDrivenSolver":
+    def from_model(cls, model: Model, rate_hz: float) -> "EventDrivenSolver":
         coefficients, laws = kernel_coefficients(model)
         coefficients = set_substeps(coefficients, rate_hz, sum_law_properties(model.added_laws))
         propagators = build_propagators(coefficients)
-        if laws is not None:
-            build_laws_kernel()  # before time matters
+        build_kernel(laws is not None)  # before time matters
         return cls(model, model.parameters, coefficients, propagators, laws)
 
     def rest_state(self, index: int = 0) -> Float1D:
@@ -84,10 +82,8 @@ class EventDrivenSolver:
         added = self.model.added_acceleration(start.table_disp)
         base = start.base_acc + (0.0 if added is None else added)
         state = self._blank_state(start.index)
-        state[: STATE_BASE + 1] = closed_form.restart_state(
-            start.u, start.v, start.u_r, start.u_l, start.contact_r, start.contact_l,
-            base, self._parameters_at(start.index),
-        )[: STATE_BASE + 1]  # fmt: skip
+        linear_state = closed_form.restart_state(start, base, self._parameters_at(start.index))
+        state[: STATE_BASE + 1] = linear_state[: STATE_BASE + 1]
         if start.hidden is not None and np.isfinite(start.hidden).all():
             state[STATE_F:DIRECTION] = start.hidden[STATE_F:DIRECTION]
         if math.isnan(state[0]):
@@ -102,8 +98,8 @@ class EventDrivenSolver:
     def advance(self, state: Float1D, base_acc: Float1D, table_disp: Float1D, out: Float2D) -> None:
         added = self.model.added_acceleration(table_disp)
         base = base_acc if added is None else base_acc + added
-        integrate = integrate_samples if self.laws is None else build_laws_kernel()
-        integrate(state, self.coefficients, self.propagators, self.laws, base, out)
+        integrate = build_kernel(self.laws is not None)
+        integrate(state, self.coefficients, self.propagators, self.laws, base, out, _NO_EVENTS)
         if added is not None:
             out[2] -= added
 
@@ -120,7 +116,7 @@ class EventDrivenSolver:
         return state
 
 
-def kernel_coefficients(model: "Model") -> tuple[Coefficients, AddedLaws | None]:
+def kernel_coefficients(model: Model) -> tuple[Coefficients, AddedLaws | None]:
     """Return (coefficients that do not depend on the rate, compiled laws that effects bring)."""
     p, added = model.parameters, model.added_laws
     of_effects: dict[str, Any] = dict(model.coefficients)

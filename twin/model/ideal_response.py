@@ -7,6 +7,7 @@ import numpy as np
 
 from table_io.block import Float1D, Float2D
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 from twin.model.stepped_sine import (
     EXTREME_NAMES,
@@ -50,7 +51,7 @@ def simulate_sweep(
         )
         wave = np.sin(2 * math.pi * np.arange(1, samples * cycles + 1) / samples)
         rate_hz, out = samples * frequency_hz, np.empty((OUTPUT_COUNT, wave.size))
-        solver = model.prepare(rate_hz)
+        solver = prepare_solver(model, rate_hz)
         if state is None:
             state = solver.rest_state()
         solver.set_clock(state, time * rate_hz)

@@ -1,4 +1,4 @@
-"""`Model`: base parameters and the effects added to them; selects its solver."""
+"""`Model`: base parameters and the effects added to them."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,7 +11,6 @@ from table_io.errors import InputError, suggest
 from twin.laws.effect import Effect
 from twin.laws.library import find_effect
 from twin.model.parameters import Parameters
-from twin.model.solver import Solver
 
 SENSOR_CHANNELS = (
     "rel_disp_m", "rel_vel_m_s", "mass_disp_m", "mass_acc_m_s2",
@@ -236,20 +235,6 @@ class Model:
                 for (effect, channel), own in effects.items()
             ),
         )
-
-    def prepare(self, rate_hz: float) -> Solver:
-        """Return the solver at this sampling rate: closed form if effects allow, else event-driven.
-
-        Compiles its kernels if they are not cached. InputError as in `check_rate`.
-        """
-        self.check_rate(rate_hz)
-        if any(instance.effect.acts in ("force", "linear") for instance in self.present_effects):
-            from twin.model.event_integrator import EventDrivenSolver
-
-            return EventDrivenSolver.from_model(self, rate_hz)
-        from twin.model.closed_form import ClosedFormSolver
-
-        return ClosedFormSolver.from_model(self, rate_hz)
 
     def check_rate(self, rate_hz: float) -> None:
         """Raise InputError if this sampling rate is too low to resolve a contact."""
