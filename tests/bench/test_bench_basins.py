@@ -12,14 +12,14 @@ import pytest
 
 from tests.bench.test_bench_model import AG, G4
 from twin.dynamics.basins import StartGrid, compute_basins_over
-from twin.dynamics.stroboscopic import OperatingPoint
+from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 
 
 @pytest.mark.benchmark(group="basins")
 def test_basins_over_frequency(benchmark):
     """Goal: 30 s on two cores."""
-    point, full = OperatingPoint(Model(G4), 1.0, AG), benchmark.enabled
+    point, full = make_period_map(Model(G4), 1.0, AG), benchmark.enabled
     grid = StartGrid.from_limits(6e-3, 0.15, *((50, 100) if full else (3, 3)))
     frequencies = np.linspace(0.5, 5.0, 92) if full else [2.0, 3.4]
     with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as pool:

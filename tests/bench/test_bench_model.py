@@ -14,6 +14,7 @@ from twin.model import closed_form
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.prepare import prepare_solver
 from twin.model.solver import Solver
 from twin.model.stepped_sine import simulate_stepped_sine
 from twin.studies.cases import make_gap_variants
@@ -104,7 +105,7 @@ def test_sweep_of_the_paper_at_g4(benchmark):
 
 def shaken(model: Model, seconds: float = 10.0) -> tuple[Solver, np.ndarray, np.ndarray]:
     base = AG * np.sin(2 * math.pi * 2.6 * np.arange(1, round(seconds * RATE) + 1) / RATE)
-    return model.prepare(RATE), base, np.empty((7, base.size))
+    return prepare_solver(model, RATE), base, np.empty((7, base.size))
 
 
 EFFECTS = {

@@ -41,8 +41,8 @@ from twin.compare.monitoring.jumps import (
     track_jumps,
 )
 from twin.dynamics.continuation import continue_branch
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.orbits import settle_to_orbit
-from twin.dynamics.period_map import make_period_map
 from twin.model.ideal_response import simulate_sweep
 from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import encode_item
@@ -251,9 +251,8 @@ def test_the_jumps_of_the_model_lie_at_the_folds_of_its_branches() -> None:
         ("forward", "down"), ("backward", "up"),
     ]  # fmt: skip
     level = bundle.steps[0].acceleration_m_s2
-    period_map = make_period_map(bundle.model)
     for jump, from_hz, direction in ((jumps[0], 3.0, 1), (jumps[1], 4.4, -1)):
-        start = settle_to_orbit(period_map, from_hz, level)
+        start = settle_to_orbit(make_period_map(bundle.model, from_hz, level))
         assert start is not None
         fold = continue_branch(start, "frequency", (2.4, 4.4), direction).folds[0].value
         assert abs(jump.at_hz - fold) < 1.5 * MAX_STEP_HZ

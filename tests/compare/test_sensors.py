@@ -11,6 +11,7 @@ from twin.compare.sensors import delay_signal
 from twin.compare.twins import TwinSetup, advance_twins
 from twin.laws.library import find_effect
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.transport.codec import encode_item
 
 EVERYTHING = ("bouc_wen", "maxwell_damper", "bumper_hardening", "bumper_maxwell", "gap_drift",
@@ -83,7 +84,7 @@ def test_an_offset_is_taken_out_of_the_restart_and_put_into_the_reading() -> Non
 def test_hidden_states_go_on_over_a_restart() -> None:
     """With the right model the windowed twin stays on the measured motion, memory included."""
     memory_model = model("bouc_wen", "maxwell_damper")
-    solver, base = memory_model.prepare(RATE_HZ), shaken(seconds=2.5)
+    solver, base = prepare_solver(memory_model, RATE_HZ), shaken(seconds=2.5)
     out, state = np.empty((7, base.size)), solver.rest_state()
     solver.advance(state, base, base, out)
     block = measured(G4, base)

@@ -28,6 +28,7 @@ from twin.model.closed_form import (
 )
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.solver import StateEstimate
 from twin.transport.codec import encode_item
 
 RATE_HZ = 2000.0
@@ -207,7 +208,7 @@ def reference(setup: TwinSetup, block: Block) -> tuple[Float2D, Float2D]:
             continue
         past = slice(at + 1 - H, at + 1)
         u0, v0 = estimate_motion(u[past], acc[past], RATE_HZ)
-        state = restart_state(u0, v0, 0.0, 0.0, False, False, base[at], p)
+        state = restart_state(StateEstimate(at, u0, v0), base[at], p)
         if first:
             free[:, at + 1 :] = motion(p, base[at + 1 :].copy(), state.copy())[:3]
             first = False

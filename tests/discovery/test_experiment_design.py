@@ -45,6 +45,7 @@ from twin.discovery.verdict import (
 from twin.laws.effect_file import read_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 from twin.setup.run_config import from_texts
 
@@ -90,7 +91,7 @@ def record_model(model: Model, motion: IdealTableMotion, noise_ratio: float = 1.
     """Readings with noise of a specimen that is a model, on an ideal table."""
     block = motion.block
     table_disp, table_acc = (block.channel(name) for name in ("table_disp_m", "table_acc_m_s2"))
-    solver, out = model.prepare(RATE_HZ), np.empty((OUTPUT_COUNT, len(block)))
+    solver, out = prepare_solver(model, RATE_HZ), np.empty((OUTPUT_COUNT, len(block)))
     solver.advance(solver.rest_state(-1), table_acc, table_disp, out)
     values = np.array([table_disp, table_acc, table_disp + out[0], out[2]])
     noise = np.random.default_rng(7).standard_normal(values.shape)

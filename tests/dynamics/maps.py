@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
 from tests.model.reference import AG, snm
+from twin.dynamics.closed_form_map import ClosedFormMap
 from twin.dynamics.orbits import Orbit, find_orbit, settle_to_orbit
-from twin.dynamics.period_map import ClosedFormPeriodMap, MapResult, PeriodMap
+from twin.dynamics.period_map import MapResult, PeriodMap
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
@@ -17,49 +19,57 @@ BILINEAR = Parameters(1.0, 1.0, 0.1, 29.0, 0.0, 1.0, 0.0, 1.0, math.inf)
 BILINEAR_LEVEL = 0.9 * 0.64 / 1.26
 
 
-def model_map(gap_m: float = 0.004, **changes: float) -> ClosedFormPeriodMap:
+def model_map(gap_m: float = 0.004, frequency_hz: float = 3.4, **changes: float) -> ClosedFormMap:
     """The map of the paper's model."""
-    return ClosedFormPeriodMap(Model(snm(gap_m, **changes)))
+    return ClosedFormMap(Model(snm(gap_m, **changes)), frequency_hz, AG)
 
 
-def settle(period_map, frequency_hz: float, level: float = AG, **keywords) -> Orbit:
-    """The orbit reached from rest."""
-    orbit = settle_to_orbit(period_map, frequency_hz, level, **keywords)
+def settle(period_map: PeriodMap, frequency_hz: float, **keywords) -> Orbit:
+    """The orbit reached from rest at a frequency."""
+    orbit = settle_to_orbit(period_map.with_parameter("frequency", frequency_hz), **keywords)
     assert orbit is not None
     return orbit
 
 
+@dataclass(frozen=True, eq=False)
 class FormulaMap:
     """x -> f(x, p), where p is the frequency; derivatives by central differences."""
 
+    formula: Callable
+    size: int = 1
+    frequency_hz: float = 1.0
+    acceleration_m_s2: float = 0.0
     derivatives = ("frequency", "level")
 
-    def __init__(self, formula: Callable, size: int = 1) -> None:
-        self.formula, self.size, self.scales = formula, size, np.ones(size)
-        self.model = Model(snm())
+    @property
+    def scales(self) -> np.ndarray:
+        return np.ones(self.size)
 
-    def iterate(self, x, frequency_hz, acceleration_m_s2, periods):
+    parameter, with_parameter = PeriodMap.parameter, PeriodMap.with_parameter
+
+    def iterate(self, x, periods):
         for _ in range(periods):
-            x = np.array(self.formula(*x, frequency_hz), dtype=float)
+            x = np.array(self.formula(*x, self.frequency_hz), dtype=float)
         return x
 
-    def evaluate(self, x, frequency_hz, acceleration_m_s2, periods=1):
+    def evaluate(self, x, periods=1):
         h, n = 1e-6, self.size
         columns = []
-        for index in range(n + 1):
-            step = np.zeros(n + 1)
-            step[index] = h
+        for step in h * np.eye(n + 1):
             ends = [
-                self.iterate(x + sign * step[:n], frequency_hz + sign * step[n], 0.0, periods)
+                replace(self, frequency_hz=self.frequency_hz + sign * step[n]).iterate(
+                    x + sign * step[:n], periods
+                )
                 for sign in (1, -1)
             ]
             columns.append((ends[0] - ends[1]) / (2 * h))
-        end = self.iterate(x, frequency_hz, 0.0, periods)
         derivatives = np.array(columns).T
         by_parameters = np.column_stack([derivatives[:, n], np.zeros(n)])
-        return MapResult(end, derivatives[:, :n], by_parameters, (0,), np.empty((0, 5 + n)))
+        end, no_minima = self.iterate(x, periods), np.empty((0, 5 + n))
+        return MapResult(end, derivatives[:, :n], by_parameters, (0,), no_minima)
 
     def find(self, guess, value: float, periods: int = 1) -> Orbit:
-        orbit = find_orbit(cast(PeriodMap, self), value, 0.0, np.array(guess, dtype=float), periods)
+        period_map = cast(PeriodMap, replace(self, frequency_hz=value))
+        orbit = find_orbit(period_map, np.array(guess, dtype=float), periods)
         assert orbit is not None
         return orbit

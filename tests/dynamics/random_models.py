@@ -1,23 +1,16 @@
-"""Random vibro-impact models, and what many starts find of them without any continuation.
-
-As a script: the study of `test_diagram` with the figures of each model, python -m
-tests.dynamics.random_models [first seed] [last seed] [starts] [seconds].
-"""
+"""Random vibro-impact models, and what many starts find of them without any continuation."""
 
 import math
-import signal
-import sys
-import time
 from dataclasses import dataclass, field, replace
-from itertools import zip_longest
 
 import numpy as np
 
 from tests.laws.laboratory_laws import SLIP_DAMPER, ZENER_DAMPER
 from tests.model.independent_solution import Witness
-from twin.dynamics.diagram import Diagram, compute_diagram, reduce_period
-from twin.dynamics.orbits import Orbit, find_orbit, motion_size
-from twin.dynamics.period_map import make_period_map
+from twin.dynamics.diagram import Diagram, compute_diagram
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.orbits import Orbit, find_orbit, motion_size, reduce_period
+from twin.dynamics.period_map import PeriodMap
 from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
@@ -102,23 +95,21 @@ def add_effect(
     return Model(p, (EffectInstance.create(effect, values),)), name
 
 
-def settle_start(period_map, frequency_hz: float, level: float, x: np.ndarray) -> Orbit | None:
+def settle_start(period_map: PeriodMap, x: np.ndarray) -> Orbit | None:
     """The periodic orbit in which a start ends after at most `MAX_SETTLING` periods, or None."""
     scales = period_map.scales
     for _ in range(MAX_SETTLING // 48):
-        x = period_map.iterate(x, frequency_hz, level, 40)
+        x = period_map.iterate(x, 40)
         first, size = x, motion_size(x, scales)
         for periods in range(1, MAX_PERIODS + 1):
-            x = period_map.iterate(x, frequency_hz, level, 1)
+            x = period_map.iterate(x, 1)
             size = max(size, motion_size(x, scales), 1e-15)
             if motion_size(x - first, scales) < SETTLED_DISTANCE * size:
-                orbit = find_orbit(period_map, frequency_hz, level, x, periods)
+                orbit = find_orbit(period_map, x, periods)
                 if orbit is not None and motion_size(orbit.x - x, scales) < 1e-5 * size:
                     return reduce_period(orbit)
-                return Orbit(
-                    period_map, frequency_hz, level, periods, x,
-                    np.zeros((x.size, x.size)), np.full(x.size, np.nan + 0j), (0,),
-                )  # fmt: skip
+                unknown = np.zeros((x.size, x.size)), np.full(x.size, np.nan + 0j)
+                return Orbit(period_map, periods, x, *unknown, (0,))
     return None
 
 
@@ -137,16 +128,17 @@ class Findings:
 
 def find_missed(case: RandomCase, diagram: Diagram, starts: int, seed: int, findings: Findings):
     """Settle random starts at random frequencies; the orbits must lie on the diagram."""
-    random, period_map = np.random.default_rng(seed), make_period_map(case.model)
+    random = np.random.default_rng(seed)
     p = case.model.parameters
     w = math.sqrt(p.stiffness / p.mass)
     speed = case.level * p.mass / p.damping
     for _ in range(starts):
         frequency_hz = random.uniform(*case.limits)
+        period_map = make_period_map(case.model, frequency_hz, case.level)
         x = period_map.rest()
         spread = 10 ** random.uniform(-2, 0.3)
         x[:2] += spread * speed * random.normal(size=2) * (1 / w, 1.0)
-        orbit = settle_start(period_map, frequency_hz, case.level, x)
+        orbit = settle_start(period_map, x)
         if orbit is None:
             findings.irregular += 1
             continue
@@ -201,7 +193,7 @@ def contradicts_simulation(orbit: Orbit) -> str:
     times = math.ceil(min(14 / abs(math.log(max(largest, 1e-6))), 400))
     distance = 0.0
     for _ in range(times):
-        x = period_map.iterate(x, orbit.frequency_hz, orbit.acceleration_m_s2, n)
+        x = period_map.iterate(x, n)
         distance = motion_size(x - orbit.x, period_map.scales) / size
         if largest > 1 and distance > 100 * RELATIVE_DISTURBANCE:
             return ""
@@ -214,13 +206,11 @@ def contradicts_simulation(orbit: Orbit) -> str:
 
 def independent_return_error(orbit: Orbit) -> float:
     """Relative distance from its start, after its periods, of scipy's motion from an orbit."""
-    model, period_map = orbit.period_map.model, orbit.period_map
+    model = orbit.period_map.model
     w = 2 * math.pi * orbit.frequency_hz
     base = model.base
     u, v = orbit.x[:2]
-    out = period_map.sample_motion(
-        orbit.x, orbit.frequency_hz, orbit.acceleration_m_s2, orbit.periods, orbit.periods * 100
-    )
+    out = orbit.sample_motion(orbit.periods * 100)
     size = max(np.abs(out[0]).max(), 1e-12)
     if base.gap_r == base.gap_l == 0 and not base.bumper_damping_r:
         # Both guards would be zero at once, and scipy would not see the second one.
@@ -261,41 +251,3 @@ def study_case(seed: int, starts: int, values: int, draws: int, orbits: int = 12
     find_missed(case, diagram, starts, seed + 1_000_000, findings)
     check_orbits(diagram, orbits, 2, seed + 2_000_000, findings)
     return case, diagram, findings
-
-
-def main() -> None:
-    """Print the figures of each model; one that takes longer than the last argument is skipped."""
-    first, last, starts, seconds = (
-        int(given or default)
-        for given, default in zip_longest(sys.argv[1:], ("0", "100", "200", "600"))
-    )
-
-    def stop(*_: object) -> None:
-        raise TimeoutError
-
-    signal.signal(signal.SIGALRM, stop)
-    # Models with an effect last: they take twenty times as long.
-    for seed in sorted(range(first, last), key=lambda seed: seed % 3 == 0):
-        began = time.perf_counter()
-        values, draws = (31, 3) if seed % 3 == 0 else (161, 10)
-        signal.alarm(seconds)
-        try:
-            case, diagram, findings = study_case(seed, starts, values, draws)
-        except TimeoutError:
-            print(
-                f"{seed} {draw_case(seed).effect or 'snm'}: skipped after {seconds} s", flush=True
-            )
-            continue
-        signal.alarm(0)
-        isolas, bands = len(diagram.isolas), len(diagram.chaotic_bands)
-        print(
-            f"{seed} {case.effect or 'snm'}: {len(diagram.branches)} branches, {isolas} isolas, "
-            f"{bands} bands; settled {findings.settled}, irregular {findings.irregular}, missed "
-            f"{findings.missed}; checked {findings.checked}, scipy {findings.independent}, "
-            f"false {findings.false}; {time.perf_counter() - began:.1f} s",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()

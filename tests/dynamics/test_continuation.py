@@ -1,4 +1,4 @@
-"""Branches: folds, grazings and branch points by number, switching, and why a branch ends."""
+"""Branches and loci: bifurcations by number, switching, and why a branch ends."""
 
 import math
 
@@ -8,9 +8,10 @@ import pytest
 from tests.dynamics.maps import BILINEAR, BILINEAR_LEVEL, FormulaMap, model_map, settle
 from tests.input_errors import raises_input_error
 from tests.model.reference import AG
+from twin.dynamics.closed_form_map import ClosedFormMap
 from twin.dynamics.continuation import continue_branch, switch_branch
+from twin.dynamics.loci import continue_locus
 from twin.dynamics.orbits import find_orbit
-from twin.dynamics.period_map import ClosedFormPeriodMap
 from twin.model.model import Model
 
 
@@ -24,9 +25,9 @@ def g4():
     return continue_branch(settle(model_map(), 5.0), "frequency", (1.5, 5.0))
 
 
-def test_bilinear_oscillator() -> None:
+def test_bilinear_oscillator_folds_and_grazes_where_known() -> None:
     """The fold agrees with a solution in 30 digits for the two event times and the velocity."""
-    orbit = settle(ClosedFormPeriodMap(Model(BILINEAR)), 1 / math.pi, BILINEAR_LEVEL)
+    orbit = settle(ClosedFormMap(Model(BILINEAR), 1.0, BILINEAR_LEVEL), 1 / math.pi)
     branch = continue_branch(orbit, "frequency", (0.5 / (2 * math.pi), 1 / math.pi))
     grazings = 2 * math.pi * np.array(values_of(branch, "grazing"))
     assert grazings == pytest.approx([0.74087833, 1.20045796], abs=1e-8)
@@ -77,22 +78,18 @@ def test_coexisting_orbits_at_g4(g4, frequency, amplitudes_mm, multiplier) -> No
 
 
 def test_multipliers_are_those_of_small_perturbations(g4) -> None:
-    """Brute force: eigenvalues of how the stepped driver moves perturbed starts."""
+    """Brute force: eigenvalues of how the map moves perturbed starts."""
     for orbit in (*g4.orbits_at(3.4), *g4.orbits_at(2.7)):
-        period_map, h, columns = orbit.period_map, 1e-8, []
-        for index in (0, 1):
-            ends = []
-            for sign in (1, -1):
-                x = orbit.x.copy()
-                x[index] += sign * h
-                for face in (2, 3):
-                    in_contact = period_map.to_state(orbit.x)[face + 2]
-                    x[face] += sign * h * (index == 0) * in_contact
-                ends.append(period_map.iterate(x, orbit.frequency_hz, AG, 1)[:2])
-            columns.append((ends[0] - ends[1]) / (2 * h))
-        brute = np.linalg.eigvals(np.array(columns).T)
-        brute = brute[np.argsort(-np.abs(brute))]
-        assert np.abs(brute) == pytest.approx(np.abs(orbit.multipliers[:2]), abs=1e-4)
+        h, period_map = 1e-8, orbit.period_map
+        free, directions = period_map.free_directions(orbit.x)
+        columns = [
+            (period_map.iterate(orbit.x + step, 1) - period_map.iterate(orbit.x - step, 1))[free]
+            for step in h * directions.T[:2]
+        ]
+        brute = np.linalg.eigvals(np.array(columns).T[:2] / (2 * h))
+        assert sorted(np.abs(brute)) == pytest.approx(
+            sorted(np.abs(orbit.multipliers[:2])), abs=1e-4
+        )
 
 
 @pytest.mark.parametrize(
@@ -104,9 +101,8 @@ def test_branch_over_the_gap(frequency, grazing_mm, fold_mm) -> None:
     assert 1e3 * max(values_of(branch, "fold")) == pytest.approx(fold_mm, abs=1e-6)
 
 
-def test_symmetry_breaking_period_doubling_and_their_branches() -> None:
-    symmetric = continue_branch(settle(model_map(), 5.0), "frequency", (1.6, 5.0))
-    (pitchfork,) = symmetric.of_kind("pitchfork")
+def test_symmetry_breaking_period_doubling_and_their_branches(g4) -> None:
+    (pitchfork,) = g4.of_kind("pitchfork")
     assert pitchfork.value == pytest.approx(1.7365957697, abs=1e-8)
     assert abs(pitchfork.orbit.multipliers[0] - 1) < 1e-6
     doublings = []
@@ -121,9 +117,7 @@ def test_symmetry_breaking_period_doubling_and_their_branches() -> None:
     doubled = switch_branch(doublings[0], "frequency", (1.43, 1.8))
     orbit = doubled.points[-1].orbit
     assert orbit.periods == 2
-    assert (
-        np.abs(orbit.period_map.iterate(orbit.x, orbit.frequency_hz, AG, 1) - orbit.x).max() > 1e-5
-    )
+    assert np.abs(orbit.period_map.iterate(orbit.x, 1) - orbit.x).max() > 1e-5
     assert values_of(doubled, "period doubling") == pytest.approx([1.436643], abs=1e-6)
 
 
@@ -137,9 +131,8 @@ def test_a_branch_that_leaves_ends_where_it_meets_its_parent_again() -> None:
 
 
 def test_period_five_window_is_a_closed_loop() -> None:
-    period_map = model_map()
-    x = period_map.iterate(period_map.rest(), 1.178, AG, 4000)
-    orbit = find_orbit(period_map, 1.178, AG, x, 5)
+    period_map = model_map(frequency_hz=1.178)
+    orbit = find_orbit(period_map, period_map.iterate(period_map.rest(), 4000), 5)
     assert orbit is not None
     assert orbit.stable
     branch = continue_branch(orbit, "frequency", (1.0, 1.4))
@@ -178,7 +171,7 @@ def test_every_orbit_of_any_model_is_periodic_and_admissible(name) -> None:
     assert [end.reason for end in branch.ends] == ["range end", "range end"]
     for point in branch.points:
         orbit = point.orbit
-        result = orbit.period_map.evaluate(orbit.x, orbit.frequency_hz, AG)
+        result = orbit.period_map.evaluate(orbit.x)
         residual = np.abs((result.end - orbit.x) / orbit.period_map.scales).max()
         assert residual < 1e-11 * max(1, abs(orbit.multipliers[0]))
 
@@ -193,20 +186,12 @@ def test_any_parameter(parameter, limits) -> None:
     assert {end.reason for end in branch.ends} == {"range end"}
     assert set(branch.values[[0, -1]]) <= set(limits)
     middle = branch.points[len(branch.points) // 2]
-    again = middle.orbit.period_map.iterate(
-        middle.orbit.x, middle.orbit.frequency_hz, middle.orbit.acceleration_m_s2, 1
-    )
-    assert again == pytest.approx(middle.orbit.x, abs=1e-10)
-    attribute = "acceleration_m_s2" if parameter == "level" else None
-    value = (
-        getattr(middle.orbit, attribute)
-        if attribute
-        else middle.orbit.period_map.parameter(parameter)
-    )
-    assert value == middle.value
+    own = middle.orbit
+    assert own.period_map.iterate(own.x, 1) == pytest.approx(own.x, abs=1e-10)
+    assert own.period_map.parameter(parameter) == middle.value
 
 
-def test_the_folds_over_the_level_are_those_over_the_frequency(g4) -> None:
+def test_folds_over_the_level_are_those_over_the_frequency(g4) -> None:
     fold = g4.of_kind("fold")[0]
     upper = g4.orbits_at(fold.value - 1e-3)[0]
     branch = continue_branch(upper, "level", (0.2, 0.8))
@@ -276,3 +261,70 @@ def test_points_and_inputs_are_limited() -> None:
     fold = continue_branch(orbit, "frequency", (2.0, 5.0)).folds[0]
     with raises_input_error(key="kind", value="fold"):
         switch_branch(fold, "frequency", (1.0, 5.0))
+
+
+# Loci over two parameters
+
+GAP_LIMITS, LEVEL_LIMITS = ((1.3, 5.5), (0.0, 0.03)), ((1.4, 5.0), (0.05, 2.0))
+
+
+def flight_amplitude(frequency, level):
+    w = 2 * math.pi * frequency
+    return level / np.abs(36e3 / 550 - w * w + 2j * w)
+
+
+def test_grazings_are_those_of_linear_flight(g4) -> None:
+    grazing = g4.of_kind("grazing")[0]
+    locus = continue_locus(grazing, ("frequency", "gap"), GAP_LIMITS)
+    frequency, gap = locus.values.T
+    assert gap == pytest.approx(2 * flight_amplitude(frequency, AG), rel=1e-10)
+    assert [end.reason for end in locus.ends] == ["range end"] * 2
+    locus = continue_locus(grazing, ("frequency", "level"), LEVEL_LIMITS)
+    frequency, level = locus.values.T
+    assert flight_amplitude(frequency, level) == pytest.approx(0.002, rel=1e-10)
+
+
+def test_the_locus_of_folds_passes_both_folds_at_other_gaps(g4) -> None:
+    """Folds of the branches at G10 and G16, and over the gap at 3.4 and 2.0 Hz, lie on it."""
+    locus = continue_locus(g4.of_kind("fold")[0], ("frequency", "gap"), GAP_LIMITS)
+    assert locus.kind == "fold"
+    for orbit in locus.orbits[::10]:
+        assert abs(orbit.multipliers - 1).min() < 2e-5
+    frequency, gap_mm = locus.values[:, 0], 1e3 * locus.values[:, 1]
+    cusp = int(frequency.argmax())
+    curves = [slice(cusp, None), slice(None, cusp + 1)]
+    for gap, folds_hz in ((10.0, (3.157626, 2.013866)), (4.0, (4.027372, 2.787294))):
+        crossings = []
+        for curve in curves:
+            order = np.argsort(gap_mm[curve])
+            crossings.append(np.interp(gap, gap_mm[curve][order], frequency[curve][order]))
+        assert sorted(crossings) == pytest.approx(sorted(folds_hz), abs=0.01)
+
+
+def test_permanent_contact_begins_at_the_lowest_grazing_of_the_push() -> None:
+    orbit = settle(model_map(-0.010), 6.9)
+    branch = continue_branch(orbit, "gap", (-0.010, -0.003))
+    grazing = branch.bifurcations[0]
+    assert (grazing.kind, grazing.side, grazing.guard) == ("grazing", "both", "push")
+    locus = continue_locus(
+        grazing, ("frequency", "gap"), ((6.0, 8.0), (-0.006, -0.001)), max_step=0.02
+    )
+    frequency, gap = locus.values.T
+    lowest = int(gap.argmin())
+    near = slice(lowest - 2, lowest + 3)
+    a, b, c = np.polyfit(frequency[near] - frequency[lowest], gap[near], 2)
+    assert 1e3 * (c - b * b / (4 * a)) == pytest.approx(-4.264886, abs=1e-6)
+
+
+def test_locus_of_period_doublings_and_what_has_none(g4) -> None:
+    """x -> r x (1 - x) - level doubles its period where (r - 1)^2 = 4 + 4 r level (by hand)."""
+    logistic = FormulaMap(lambda x, r: [r * x * (1 - x)])
+    branch = continue_branch(logistic.find([0.6], 2.5), "frequency", (2.0, 4.0))
+    (doubling,) = branch.of_kind("period doubling")
+    locus = continue_locus(doubling, ("frequency", "level"), ((2.0, 4.0), (-1.0, 1.0)))
+    assert locus.values[:, 0] == pytest.approx(3.0, abs=1e-8)  # the level has no effect
+    assert {locus.values[0, 1], locus.values[-1, 1]} == {-1.0, 1.0}
+    with raises_input_error(key="kind", value="pitchfork"):
+        continue_locus(g4.of_kind("pitchfork")[0])
+    with raises_input_error(key="gap", value=0.004):
+        continue_locus(g4.folds[0], ("frequency", "gap"), ((1.3, 5.5), (0.01, 0.03)))

@@ -8,10 +8,11 @@ import pytest
 from table_io.config.excitation.orbit_plan import pack_harmonics
 from tests.model.reference import AG, snm
 from twin.dynamics.continuation import continue_branch
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.linearized_orbit import LinearizedOrbit, find_harmonics
 from twin.dynamics.orbits import settle_to_orbit
-from twin.dynamics.period_map import make_period_map
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 
 FREQUENCY_HZ = 3.4
@@ -20,7 +21,7 @@ PERIOD_SAMPLES = 1000  # of a period with a perturbed drive
 
 def find_unstable(model):
     """The unstable orbit between the two stable ones of G4 at 3.4 Hz."""
-    start = settle_to_orbit(make_period_map(model), 4.6, AG)
+    start = settle_to_orbit(make_period_map(model, 4.6, AG))
     assert start is not None
     branch = continue_branch(start, "frequency", (2.7, 4.7))
     return next(orbit for orbit in branch.orbits_at(FREQUENCY_HZ) if not orbit.stable)
@@ -38,7 +39,7 @@ def solve_perturbed(orbit, added):
     """Harmonics of u on the orbit solved again with `added` m/s2, (PERIOD_SAMPLES,)."""
     phase = 2 * math.pi * np.arange(1, PERIOD_SAMPLES + 1) / PERIOD_SAMPLES
     base = orbit.acceleration_m_s2 * np.sin(phase) + added
-    solver = orbit.period_map.model.prepare(PERIOD_SAMPLES * orbit.frequency_hz)
+    solver = prepare_solver(orbit.period_map.model, PERIOD_SAMPLES * orbit.frequency_hz)
 
     def advance(start):
         state = orbit.period_map.to_state(np.append(start, orbit.x[2:]))

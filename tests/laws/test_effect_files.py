@@ -17,6 +17,7 @@ from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import EffectInstance, Model
+from twin.model.prepare import prepare_solver
 from twin.model.valid_range import find_range_exits
 
 HEADER = """title = "x"
@@ -52,7 +53,7 @@ def simulate(model, level=1.0, frequency=3.0, seconds=4.0):
     """Run a model under a growing sine at 1 kHz; return its outputs."""
     time = np.arange(round(seconds * 1000)) / 1000
     drive = level * time / seconds * np.sin(2 * np.pi * frequency * time)
-    solver = model.prepare(1000.0)
+    solver = prepare_solver(model, 1000.0)
     out = np.empty((7, time.size))
     solver.advance(solver.rest_state(), drive, -drive / (2 * np.pi * frequency) ** 2, out)
     return out
@@ -157,14 +158,14 @@ class TestRefusals:
         text += "[parameters.w]\nunit = 'm'\nlow = 1e-9\nhigh = 1.0\ntypical = 0.1\n"
         model = add(read_effect(text), k=1.0, w=1e-7)
         with pytest.raises(InputError) as caught:
-            model.prepare(1000.0)
+            prepare_solver(model, 1000.0)
         assert "steep" in caught.value.where
 
     def test_growing_states_are_refused(self):
         text = BRANCH.replace("- f / tau", "+ f / tau")
         model = add(read_effect(text), k=1.0, tau=1e-3)
         with pytest.raises(InputError):
-            model.prepare(1000.0)
+            prepare_solver(model, 1000.0)
 
     @pytest.mark.parametrize("name", ["../own.toml", "/dev/zero", "a\\u0000b", "sub/own.toml", ""])
     def test_a_model_names_files_next_to_it_only(self, tmp_path, name):

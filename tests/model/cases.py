@@ -7,6 +7,7 @@ import numpy as np
 from tests.model.reference import AG, snm
 from twin.laws.library import EFFECTS
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import StateEstimate
 
 RATE_HZ = 2000.0
@@ -51,7 +52,7 @@ def drive(
     model: Model, base: np.ndarray, start: StateEstimate | None = None, rate: float = RATE_HZ
 ):
     """(state, out) after the samples."""
-    solver = model.prepare(rate)
+    solver = prepare_solver(model, rate)
     state = solver.rest_state() if start is None else solver.restart_state(start)
     out = np.empty((7, base.size))
     solver.advance(state, base, 0.01 * base, out)

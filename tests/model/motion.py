@@ -7,6 +7,7 @@ import numpy as np
 from tests.model.reference import AG
 from twin.model import closed_form
 from twin.model.parameters import Parameters
+from twin.model.solver import StateEstimate
 
 U, V, A, F_R, F_L, U_R, U_L = range(7)
 
@@ -17,7 +18,7 @@ def run(
     """(state, out, events) after the samples `base` from `state` or from rest."""
     state = closed_form.rest_state(p) if state is None else state.copy()
     out, events = np.empty((7, base.size)), np.zeros((4 * base.size + 10, 5))
-    count = closed_form.advance_state_logged(
+    count = closed_form.advance_state(
         state, closed_form.discretized_params(p, rate), base, out, events
     )
     return state, out, events[:count]
@@ -31,4 +32,9 @@ def sine(frequency: float, rate: float, seconds: float, peak: float = AG) -> np.
 def kick(p: Parameters, speed: float) -> np.ndarray:
     """Rest, hit by a hammer: contacts that would pull then are released."""
     u, _, ur, ul, right, left, *_ = closed_form.rest_state(p)
-    return closed_form.restart_state(u, speed, ur, ul, right > 0, left > 0, 0.0, p)
+    return restart(p, u, speed, ur, ul, right > 0, left > 0)
+
+
+def restart(p: Parameters, *estimate, base: float = 0.0) -> np.ndarray:
+    """The state at an estimate (u, v, u_r, u_l, contacts) with A = base."""
+    return closed_form.restart_state(StateEstimate(0, *estimate), base, p)

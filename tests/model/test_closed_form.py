@@ -160,7 +160,7 @@ def test_more_events_than_rows_are_counted():
     p, base = snm(), sine(3.4, 2000.0, 5)
     state, events = kick(p, 0.1), np.zeros((3, 5))
     out = np.empty((7, base.size))
-    count = closed_form.advance_state_logged(
+    count = closed_form.advance_state(
         state, closed_form.discretized_params(p, 2000.0), base, out, events
     )
     assert count > 3

@@ -20,6 +20,7 @@ from twin.model.event_integrator_kernel import (
     STATE_Z,
 )
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import StateEstimate
 
 PAIRS = [
@@ -138,7 +139,7 @@ PASSIVE = [m for m in MODELS if "gap_drift" not in name(m)]
 def test_no_effect_creates_energy(model, seed):
     """Shaken at random, then left alone: what is stored only falls, events included."""
     model = Model(model.base, model.effects)
-    solver = model.prepare(2000.0)
+    solver = prepare_solver(model, 2000.0)
     state, _ = drive(model, noisy(0.5, seed))
     out, before = np.empty((7, 1)), math.inf
     solver.advance(state, np.zeros(1), np.zeros(1), out)

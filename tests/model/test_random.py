@@ -7,8 +7,9 @@ import pytest
 
 from tests.model.motion import U_L, U_R, U, kick, run
 from tests.model.reference import linear_between, reference
+from twin.dynamics.event_driven_map import make_period_map
+from twin.model.model import Model
 from twin.model.parameters import Parameters
-from twin.model.periodic_orbit import contact_events
 from twin.model.stepped_sine import simulate_stepped_sine
 
 SIZE_M = 3e-3  # m: of gaps and motions
@@ -67,7 +68,9 @@ def stepped_errors(seed: int) -> tuple[float, float, int]:
         p, start[:4], touch, lambda t: peak * math.sin(w_drive * t), ends,
         dt=1 / (FEWEST_STEPS * fast),
     )  # fmt: skip
-    impacts, state = contact_events(p, hz, peak, start, 3)
+    period_map = make_period_map(Model(p), hz, peak)
+    impacts, x = period_map.find_contacts(start.take(period_map.indices), 3)
+    state = period_map.to_state(x)
     assert impacts[:, 1:].tolist() == contacts[:, 1:].tolist()
     end = simulate_stepped_sine(p, [hz], peak, 3, 8, start).states[0]
     error = max(

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.model.motion import U_R, kick, run, sine
+from tests.model.motion import U_R, kick, restart, run, sine
 from tests.model.reference import snm
 from twin.model import closed_form
 
@@ -41,7 +41,7 @@ def test_a_lost_sample_makes_everything_after_it_nan(bad, gap):
     assert np.isfinite(out[:, :500]).all()
     assert np.isnan(out[:, 500:]).all()
     assert np.isnan(state).all()
-    again = closed_form.restart_state(0.0, 0.0, 0.0, 0.0, False, False, 0.0, snm(gap))
+    again = restart(snm(gap), 0.0, 0.0)
     assert np.isfinite(run(snm(gap), 2000.0, sine(3.4, 2000.0, 1), again)[1]).all()
 
 
@@ -61,26 +61,26 @@ def test_the_bumper_remembers():
 
 def test_a_relaxed_bumper_is_flushed_before_it_is_denormal():
     p = snm()
-    state = closed_form.restart_state(0.0, 0.0, 1e-3, -1e-3, False, False, 0.0, p)
+    state = restart(p, 0.0, 0.0, 1e-3, -1e-3)
     state, _, _ = run(p, 2000.0, np.zeros(1000), state)
     assert state[2] == 0.0 == state[3]
 
 
 def test_restart_makes_a_state_the_model_allows():
     p = snm()
-    pushed = closed_form.restart_state(0.003, 0.05, 0.0, 0.0, True, False, 0.1, p)
+    pushed = restart(p, 0.003, 0.05, 0.0, 0.0, True, False, base=0.1)
     assert pushed[2] == pytest.approx(0.001)
     assert pushed[4:7].tolist() == [1.0, 0.0, 0.1]
-    pulled = closed_form.restart_state(0.0021, -0.5, 0.0, 0.0, True, False, 0.0, p)
+    pulled = restart(p, 0.0021, -0.5, 0.0, 0.0, True, False)
     assert pulled[2] == pytest.approx(0.0001)
     assert pulled[4] == 0.0
-    sunk = closed_form.restart_state(-0.003, -0.05, 0.0, -0.0002, False, False, 0.0, p)
+    sunk = restart(p, -0.003, -0.05, 0.0, -0.0002)
     assert sunk[3] == pytest.approx(-0.001)
     assert sunk[5] == 1.0
-    apart = closed_form.restart_state(0.0, 0.1, 0.0005, 0.0, True, False, 0.0, p)
+    apart = restart(p, 0.0, 0.1, 0.0005, 0.0, True, False)
     assert apart[2] == 0.0005
     assert apart[4] == 0.0
-    none = closed_form.restart_state(0.003, 0.05, 0.0, 0.0, True, True, 0.0, snm(math.inf))
+    none = restart(snm(math.inf), 0.003, 0.05, 0.0, 0.0, True, True)
     assert none[2:6].tolist() == [0.0, 0.0, 0.0, 0.0]
 
 
@@ -91,7 +91,7 @@ def test_restart_from_the_models_own_state_goes_on_as_before():
     for first in range(0, 4000, 37):
         out, other = np.empty((7, 37)), np.empty((7, 37))
         u, v, u_r, u_l, right, left, acceleration = state[:7]
-        again = closed_form.restart_state(u, v, u_r, u_l, right > 0, left > 0, acceleration, p)
+        again = restart(p, u, v, u_r, u_l, right > 0, left > 0, base=acceleration)
         again[7:] = state[7:]
         part = base[first : first + 37]
         closed_form.advance_state(state, con, part, out[:, : part.size])

@@ -14,12 +14,18 @@ from twin.drawing.basin_figures import (
     draw_section,
 )
 from twin.drawing.plot_style import save_figures
-from twin.dynamics.basins import StartGrid, compute_basins, compute_basins_over
-from twin.dynamics.brute_force import find_chaotic_bands, follow_attractor, record_section
-from twin.dynamics.stroboscopic import OperatingPoint
+from twin.dynamics.basins import (
+    StartGrid,
+    compute_basins,
+    compute_basins_over,
+    find_chaotic_bands,
+    follow_attractor,
+    record_section,
+)
+from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 
-POINT = OperatingPoint(Model(snm()), 3.4, AG)
+POINT = make_period_map(Model(snm()), 3.4, AG)
 GRID = StartGrid.from_limits(6e-3, 0.15, 7, 7)
 
 

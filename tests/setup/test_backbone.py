@@ -13,7 +13,7 @@ from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
 from tests.model.reference import snm
 from tests.table_io.acquisition.test_orbit_session import RATE_HZ, Run, run
-from twin.dynamics.period_map import make_period_map
+from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming
 from twin.setup.orbit_plan import make_backbone_plan
@@ -36,24 +36,25 @@ TRUE_BACKBONE = np.array([
 
 @pytest.fixture(scope="module")
 def period_map():
-    return make_period_map(Model(snm()))
+    """The map of the paper's model at any level."""
+    return lambda level: make_period_map(Model(snm()), 1.0, level)
 
 
 def test_without_contact_phase_resonance_is_that_of_the_linear_oscillator(period_map) -> None:
     """K u + C u' = -M (u'' + a sin wt): at w = sqrt(K / M), u = M a / (C w) cos wt."""
     level = 0.02  # m/s2: below the gap
-    orbit = find_phase_resonance(period_map, (1.0, 2.0), level)
+    orbit = find_phase_resonance(period_map(level), (1.0, 2.0))
     w = math.sqrt(36000.0 / 550.0)
     assert orbit.frequency_hz == pytest.approx(w / (2 * math.pi), rel=1e-5)
     assert orbit.u_max == pytest.approx(550.0 * level / (1100.0 * w), rel=1e-3)
-    assert len(find_resonance_approach(period_map, (1.0, 2.0), level)) == 1  # no fold, no leads
+    assert len(find_resonance_approach(period_map(level), (1.0, 2.0))) == 1  # no fold, no leads
 
 
 def test_with_contact_u_leads_by_90_degrees_and_orbits_lead_up_from_below_the_folds(
     period_map,
 ) -> None:
     level = 0.02 * GRAVITY_M_S2
-    *leads, orbit = find_resonance_approach(period_map, RANGE_HZ, level)
+    *leads, orbit = find_resonance_approach(period_map(level), RANGE_HZ)
     assert measure_orbit_phase(orbit) == pytest.approx(90.0, abs=2e-3)
     assert orbit.stable
     frequencies = [lead.frequency_hz for lead in leads]
@@ -66,7 +67,7 @@ def test_with_contact_u_leads_by_90_degrees_and_orbits_lead_up_from_below_the_fo
 @pytest.mark.parametrize("range_hz", [(1.0, 2.0), (5.0, 6.0)])
 def test_range_without_phase_resonance_is_refused_with_where_it_is(period_map, range_hz) -> None:
     with raises_input_error(key="excitation.start_hz", value=range_hz[0]) as caught:
-        find_phase_resonance(period_map, range_hz, 0.05 * GRAVITY_M_S2)
+        find_phase_resonance(period_map(0.05 * GRAVITY_M_S2), range_hz)
     assert "0.05 g" in str(caught.value)
     assert "degrees" in str(caught.value)
 

@@ -9,7 +9,7 @@ from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Profile
 from tests.input_errors import raises_input_error
 from tests.model.reference import AG, snm
-from twin.dynamics.period_map import make_period_map
+from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming, OpenLoop, closed_loop_multipliers
 from twin.setup.orbit_plan import find_unstable_stretch, make_orbit_plan
@@ -33,7 +33,7 @@ def planned_config() -> RunConfig:
 
 @pytest.fixture(scope="module")
 def stretch():
-    return find_unstable_stretch(make_period_map(Model(snm())), RANGE_HZ, AG)
+    return find_unstable_stretch(make_period_map(Model(snm()), RANGE_HZ[1], AG), RANGE_HZ)
 
 
 def test_plan_goes_through_both_folds(plan):
@@ -62,8 +62,8 @@ def test_orbits_of_the_plan_are_those_of_the_model(plan):
 
 def test_gains_hold_every_orbit_with_a_wrong_model(plan):
     """Every planned gain pair holds the orbit of a model of 3 % more mass at a longer latency."""
-    heavy = make_period_map(Model(snm())).with_parameter("mass", 550.0 * 1.03)
-    varied = find_unstable_stretch(heavy, RANGE_HZ, AG)
+    heavy = make_period_map(Model(snm()), RANGE_HZ[1], AG).with_parameter("mass", 550.0 * 1.03)
+    varied = find_unstable_stretch(heavy, RANGE_HZ)
     for point, position in zip(
         plan.points[3::6], np.arange(UNSTABLE_POINTS)[::6] / UNSTABLE_POINTS, strict=False
     ):

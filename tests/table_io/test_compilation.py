@@ -192,23 +192,16 @@ def list_kernels() -> list[Any]:
     from table_io import sensor_errors
     from table_io.safety.protection import sample_checks
     from table_io.sim import plant
-    from twin.dynamics import event_driven_kernel, stroboscopic_kernel
+    from twin.dynamics import closed_form_map
     from twin.earthquakes import table_model
-    from twin.model import (
-        closed_form_kernel,
-        event_integrator_kernel,
-        inverse_dynamics,
-        periodic_orbit,
-        stepped_sine_kernel,
-    )
+    from twin.model import closed_form, event_integrator_kernel, inverse_dynamics, stepped_sine
     from twin.results import spectra
 
-    return [
+    return [event_integrator_kernel.build_kernel(False)] + [
         kernel
         for module in (
             sensor_errors, sample_checks, plant, spectra, table_model,
-            event_driven_kernel, stroboscopic_kernel, closed_form_kernel, event_integrator_kernel,
-            inverse_dynamics, periodic_orbit, stepped_sine_kernel,
+            closed_form_map, closed_form, inverse_dynamics, stepped_sine,
         )
         for kernel in vars(module).values()
         if getattr(kernel, "__module__", "") == module.__name__
@@ -231,14 +224,14 @@ def test_no_kernel_is_kept_by_numba_alone() -> None:
 def test_kernels_name_all_modules_that_they_are_made_of() -> None:
     kernels = {kernel.py_func.__qualname__: kernel for kernel in list_kernels()}
     assert {
-        "check_samples", "advance_samples", "run_stepped_sine", "advance_cycles",
-        "_integrate_samples", "advance_periods", "record_points", "capture_states",
+        "check_samples", "advance_samples", "run_stepped_sine", "advance_variations",
+        "integrate_samples", "record_points", "capture_points",
         "follow_oscillators", "_force_kernel", "_simulate", "_advance_samples",
     } <= set(kernels)  # fmt: skip
-    parts = set(compilation._describe_item(kernels["_integrate_samples"], set()))
-    assert {"hysteretic_variable", "find_event", "static_friction"} & parts
+    parts = set(compilation._describe_item(kernels["integrate_samples"], set()))
+    assert {"hysteretic_variable", "locate_event", "static_friction"} & parts
     assert {"contact_mode", "advance_to_event"} <= set(
-        compilation._describe_item(kernels["advance_cycles"], set())
+        compilation._describe_item(kernels["advance_variations"], set())
     )
 
 

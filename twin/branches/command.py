@@ -14,10 +14,9 @@ from twin.branches.page import list_bifurcations, write_branch_report
 from twin.drawing.attractor_study import study_attractors
 from twin.drawing.branch_curves import BranchSet, make_axis
 from twin.dynamics.diagram import compute_diagram
-from twin.dynamics.main_branches import follow_main_branches
-from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, find_parameter, make_period_map
-from twin.dynamics.resonance_map import compute_resonance_map
-from twin.dynamics.stroboscopic import OperatingPoint
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.main_branches import compute_resonance_map, follow_main_branches
+from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, find_parameter
 from twin.model.model import Model
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import RunConfig, make_run_id, read_run_config
@@ -68,9 +67,11 @@ def show_branches(request: BranchRequest) -> int:
         plan = config.profile.plan
         with announce_if_slow(COMPILING_MESSAGE):
             resonance = compute_resonance_map(
-                make_period_map(model), request.over, np.linspace(*limits, MAP_VALUES),
-                (plan.low_hz, plan.high_hz), level,
-            )  # fmt: skip
+                make_period_map(model, plan.low_hz, level),
+                request.over,
+                np.linspace(*limits, MAP_VALUES),
+                (plan.low_hz, plan.high_hz),
+            )
         subtitle = f"{plan.low_hz:g} to {plan.high_hz:g} Hz, {level / GRAVITY_M_S2:.4g} g"
         page = write_map_report(folder, resonance, title, subtitle, toml)
         print_line(f"{format_map_headline(resonance)} -> {page}")
@@ -78,10 +79,12 @@ def show_branches(request: BranchRequest) -> int:
     branches = compute_branches(model, limits, level, frequency_hz, request)
     attractors = None
     if request.attractors or request.basins_hz is not None:
-        point = OperatingPoint(model, frequency_hz, level)
+        period_map = make_period_map(model, frequency_hz, level)
         cores = count_cores()
         with announce_if_slow(ATTRACTOR_MESSAGE), ThreadPoolExecutor(cores) as pool:
-            attractors = study_attractors(point, request.over, limits, request.basins_hz, pool.map)
+            attractors = study_attractors(
+                period_map, request.over, limits, request.basins_hz, pool.map
+            )
         bands = tuple((band.low, band.high) for band in attractors.bands)
         branches = replace(branches, chaotic=bands)
     place = f", {frequency_hz:g} Hz" if request.over != FREQUENCY else ""
@@ -105,10 +108,8 @@ def compute_branches(
     """Follow the main branches, or search for all of them."""
     if not request.complete:
         with announce_if_slow(COMPILING_MESSAGE):
-            period_map = make_period_map(model)
-            main = follow_main_branches(
-                period_map, limits, level, parameter=request.over, frequency_hz=frequency_hz
-            )
+            period_map = make_period_map(model, frequency_hz, level)
+            main = follow_main_branches(period_map, limits, parameter=request.over)
         return BranchSet(main)
     with announce_if_slow("searching for every motion; a range with chaos takes minutes"):
         diagram = compute_diagram(

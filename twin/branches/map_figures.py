@@ -22,7 +22,7 @@ from twin.drawing.plot_style import (
     Picture,
     save_figures,
 )
-from twin.dynamics.resonance_map import ResonanceMap
+from twin.dynamics.main_branches import ResonanceMap
 
 LOCUS_STYLES: dict[str, dict[str, Any]] = {
     "fold": {"color": "#c4161c", "lw": 1.6},

@@ -8,7 +8,7 @@ import numpy as np
 from twin.branches.map_figures import draw_map_figures
 from twin.drawing.branch_curves import make_axis
 from twin.drawing.page import embed_images, render_page
-from twin.dynamics.resonance_map import ResonanceMap
+from twin.dynamics.main_branches import ResonanceMap
 
 
 def write_map_report(

@@ -18,6 +18,7 @@ from twin.compare.extra_channels import TABLE_INPUTS, predict_channel
 from twin.compare.sensors import apply_sensors, keep_last, lag_samples, remove_sensor_errors
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT, Solver, StateEstimate
 
 HISTORY_S = 0.1  # of measured motion, from which a restart estimates u and u'
@@ -51,7 +52,7 @@ class TwinSetup:
 
     @cached_property
     def solver(self) -> Solver:
-        return self.model.prepare(self.rate_hz)
+        return prepare_solver(self.model, self.rate_hz)
 
     @cached_property
     def delay_samples(self) -> int:

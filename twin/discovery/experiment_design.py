@@ -53,6 +53,7 @@ from twin.discovery.selection import (
 from twin.discovery.signals import LogSignals, build_signals
 from twin.discovery.verdict import MIN_SEPARATION_SIGMA, DiscoveryVerdict
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 
 MAX_RIVALS = 3  # limits the simulations, which grow with its square
@@ -422,7 +423,7 @@ def simulate_motion(
     model = parameters.to_model()
     right, left = (gap + correction for gap in motion.gaps_m)
     base = replace(model.base, mass=motion.mass_kg, gap_r=right, gap_l=left)
-    solver = Model(base, model.effects).prepare(drive.rate_hz)
+    solver = prepare_solver(Model(base, model.effects), drive.rate_hz)
     state, out = solver.rest_state(-1), np.empty((OUTPUT_COUNT, table_acc.size))
     solver.advance(state, table_acc, table_disp, out)
     u, _, acc, force_right, force_left = out[:5]

@@ -14,16 +14,20 @@ from twin.drawing.basin_figures import (
     draw_section,
 )
 from twin.drawing.plot_style import CaptionedFigures
-from twin.dynamics.basins import Basins, ParallelMap, StartGrid, compute_basins, compute_basins_over
-from twin.dynamics.brute_force import (
+from twin.dynamics.basins import (
+    Basins,
     BifurcationDiagram,
     ChaosRange,
+    ParallelMap,
+    StartGrid,
+    compute_basins,
+    compute_basins_over,
     find_chaotic_bands,
     follow_attractor,
     record_section,
 )
 from twin.dynamics.orbits import Orbit
-from twin.dynamics.stroboscopic import OperatingPoint
+from twin.dynamics.period_map import FREQUENCY, PeriodMap
 
 if TYPE_CHECKING:
     from twin.drawing.branch_curves import BranchSet
@@ -49,7 +53,7 @@ class AttractorStudy:
 
 
 def study_attractors(
-    point: OperatingPoint,
+    period_map: PeriodMap,
     parameter: str,
     limits: tuple[float, float],
     basins_hz: float | None,
@@ -57,27 +61,29 @@ def study_attractors(
 ) -> AttractorStudy:
     """Follow the attractor over `limits` both ways and measure the basins on the way.
 
-    With `basins_hz` also the basins at this frequency in Hz, at the parameters of `point`. With the
-    `map` of a thread pool all cores are used.
+    With `basins_hz` also the basins at this frequency in Hz, at the parameters of `period_map`.
+    With the `map` of a thread pool all cores are used.
     """
     values = np.linspace(*limits, VALUE_COUNT)
-    up = follow_attractor(point, parameter, values)
-    down = follow_attractor(point, parameter, values[::-1])
+    up = follow_attractor(period_map, parameter, values)
+    down = follow_attractor(period_map, parameter, values[::-1])
     bands = find_chaotic_bands((up, down), BAND_TOLERANCE_SHARE * (limits[1] - limits[0]))
-    grid = make_start_grid(point, up, STARTS_EACH_WAY)
-    fractions = compute_basins_over(point, parameter, values, grid, map_jobs)
+    grid = make_start_grid(period_map, up, STARTS_EACH_WAY)
+    fractions = compute_basins_over(period_map, parameter, values, grid, map_jobs)
     basins = None
     if basins_hz is not None:
-        own = OperatingPoint(point.model, basins_hz, point.acceleration_m_s2)
+        own = period_map.with_parameter(FREQUENCY, basins_hz)
         basins = compute_basins(own, make_start_grid(own, up, MAP_STARTS))
     return AttractorStudy(parameter, values, up, down, bands, tuple(fractions), basins)
 
 
-def make_start_grid(point: OperatingPoint, diagram: BifurcationDiagram, count: int) -> StartGrid:
+def make_start_grid(period_map: PeriodMap, diagram: BifurcationDiagram, count: int) -> StartGrid:
     """Return a grid of starts around all motions of a diagram, `count` in u and in v."""
     sizes = [attractor.u_max for column in diagram.attractors for attractor in column]
     u_limit = START_RANGE * max((abs(size) for size in sizes), default=1e-3)
-    return StartGrid.from_limits(u_limit, u_limit * 2 * math.pi * point.frequency_hz, count, count)
+    return StartGrid.from_limits(
+        u_limit, u_limit * 2 * math.pi * period_map.frequency_hz, count, count
+    )
 
 
 def draw_attractor_figures(study: AttractorStudy, branches: "BranchSet") -> CaptionedFigures:
@@ -86,12 +92,12 @@ def draw_attractor_figures(study: AttractorStudy, branches: "BranchSet") -> Capt
     yield draw_basin_fractions(study.fractions, study.parameter, study.values)
     if study.basins is None:
         return
-    hz = study.basins.point.frequency_hz
+    hz = study.basins.period_map.frequency_hz
     yield draw_basin_map(study.basins, find_saddles(branches, hz))
     for attractor in study.basins.attractors:
         if not attractor.is_periodic:
             u, v = attractor.points[-1, :2].tolist()
-            points = record_section(study.basins.point, u, v, SECTION_CYCLES)
+            points = record_section(study.basins.period_map, u, v, SECTION_CYCLES)
             yield draw_section(points, f"Chaotic motion at {hz:g} Hz")
             break
 

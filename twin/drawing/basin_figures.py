@@ -17,8 +17,7 @@ from matplotlib.patches import Patch
 from table_io.block import Float1D, Float2D
 from twin.drawing.plot_style import CaptionedFigure
 from twin.dynamics.attractors import Attractor
-from twin.dynamics.basins import Basins
-from twin.dynamics.brute_force import BifurcationDiagram, ChaosRange
+from twin.dynamics.basins import Basins, BifurcationDiagram, ChaosRange
 from twin.model.contact_regime import U, V
 
 PARAMETER_LABELS = {
@@ -79,20 +78,20 @@ def draw_basin_map(basins: Basins, unstable: Float2D | None = None) -> Captioned
     ax.grid(visible=False)
     ax.set_xlabel("initial $u$ in mm")
     ax.set_ylabel("initial $u'$ in mm/s")
-    point = basins.point
-    ax.set_title(f"$f$ = {point.frequency_hz:.4g} Hz, {_format_gap(basins)}")
+    period_map = basins.period_map
+    ax.set_title(f"$f$ = {period_map.frequency_hz:.4g} Hz, {_format_gap(basins)}")
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return CaptionedFigure(
         "basin_map", "Basins of attraction",
         f"Attractor to which each of {basins.labels.size} starts settles, at a peak table "
-        f"acceleration of {point.acceleration_m_s2:.4g} m/s², phase 0, memory relaxed. "
+        f"acceleration of {period_map.acceleration_m_s2:.4g} m/s², phase 0, memory relaxed. "
         "Percentages: share of the starts; mm: greatest displacement of the attractor.",
         figure,
     )  # fmt: skip
 
 
 def _format_gap(basins: Basins) -> str:
-    base = basins.point.model.base
+    base = basins.period_map.model.base
     return f"$G$ = {1e3 * (base.gap_r + base.gap_l):.4g} mm"
 
 

@@ -72,6 +72,7 @@ from twin.model.stepped_sine import (
 
 STEPS_PER_CYCLE = 16
 MAX_ONSETS_PER_CYCLE = 40  # per side; room for events and minima
+MAX_CHATTER = 6  # events at once, by rounding at a graze, up to which a map is differentiable
 PARAMETER_COUNT = 4  # last columns of variations: by frequency, peak, right and left gap
 SAMPLES_PER_CYCLE = 4000  # of a sampled motion: its drive is linear between them
 # Indices of `Variations.progress`
@@ -530,6 +531,10 @@ class ClosedFormMap(PeriodMap):
         regime, event_count, minimum_count = advance_variations(
             x, *self._inputs, periods, state, variations, _NO_GROWTH, events, minima
         )
+        at_once = np.diff(events[:event_count, 0]) == 0.0
+        if np.count_nonzero(at_once) > MAX_CHATTER:
+            variations[:] = math.nan
+            state[:] = math.nan
         indices, stop = self._prepared.indices, n + len(self.derivatives)
         derivatives = variations.take(indices, axis=0)
         codes = [4 + side + 2 * onset for _, side, onset in events[:event_count].tolist()]
@@ -584,10 +589,10 @@ class ClosedFormMap(PeriodMap):
 
         Columns: time in periods, side 0 right or 1 left, onset 1 or release 0.
         """
-        state, variations = np.empty(STATE_SIZE), np.empty((4, x.size + PARAMETER_COUNT))
-        events = np.empty((4 * MAX_ONSETS_PER_CYCLE * periods, 3))
+        state, variation = np.empty(STATE_SIZE), np.zeros((4, 1 + PARAMETER_COUNT))
+        growth, events = np.empty(periods), np.empty((4 * MAX_ONSETS_PER_CYCLE * periods, 3))
         _, count, _ = advance_variations(
-            x, *self._inputs, periods, state, variations, _NO_GROWTH, events, _NO_ROWS
+            x, *self._inputs, periods, state, variation, growth, events, _NO_ROWS
         )
         return events[:count], state.take(self._prepared.indices)
 

@@ -19,6 +19,7 @@ from twin.laws.effect import Effect
 from twin.laws.library import EFFECTS
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.prepare import prepare_solver
 
 LOOPS_FILE = Path(__file__).with_name("loops.json")
 # Damper, bumpers and level of the shipped model and tests.
@@ -97,7 +98,7 @@ def _simulate_loop(model: Model, frequency_hz: float) -> ForceLoop:
     phase = 2 * math.pi * np.arange(1, SETTLE_CYCLES * SAMPLES_PER_CYCLE + 1) / SAMPLES_PER_CYCLE
     wave = np.sin(phase)
     level = LEVEL_G * GRAVITY_M_S2
-    solver, out = model.prepare(rate_hz), np.empty((7, wave.size))
+    solver, out = prepare_solver(model, rate_hz), np.empty((7, wave.size))
     state = solver.rest_state()
     solver.advance(state, level * wave, -level / (2 * math.pi * frequency_hz) ** 2 * wave, out)
     u, acceleration = out[0, -SAMPLES_PER_CYCLE:], out[2, -SAMPLES_PER_CYCLE:]

@@ -8,9 +8,10 @@ import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
 from table_io.block import Float1D
+from twin.dynamics.closed_form_map import ClosedFormMap
 from twin.dynamics.continuation import continue_branch
 from twin.dynamics.orbits import Orbit, settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY, ClosedFormPeriodMap
+from twin.dynamics.period_map import FREQUENCY
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
 from twin.paper.slow_passage import (
@@ -83,9 +84,9 @@ def find_folds(case: PaperCase, sweep: SlowSweep) -> Folds | None:
 
 def _settle(case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str) -> Orbit | None:
     """Return the orbit to which the motion of a slow sweep settles at a frequency."""
-    period_map = ClosedFormPeriodMap(Model(case.parameters))
-    start = period_map.from_state(sweep.state_at(frequency_hz, direction))
-    return settle_to_orbit(period_map, frequency_hz, case.acceleration, start)
+    period_map = ClosedFormMap(Model(case.parameters), frequency_hz, case.acceleration)
+    start = sweep.state_at(frequency_hz, direction).take(period_map.indices)
+    return settle_to_orbit(period_map, start)
 
 
 def _chaos_limit_hz(case: PaperCase) -> float:

@@ -26,8 +26,6 @@ from twin.drawing.plot_style import (
     format_minus,
     label_panel,
 )
-from twin.dynamics.period_map import ClosedFormPeriodMap
-from twin.model.model import Model
 from twin.paper.findings import find_coexisting_orbits
 from twin.paper.study import COEXISTING_HZ, PaperStudy
 from twin.results.measured_campaign import MeasuredCampaign
@@ -177,7 +175,7 @@ def _draw_loops(
             resonance.case, study.slow_sweeps[resonance.case.name], resonance.hz
         )
         if orbits is not None and orbits.unstable is not None:
-            state = ClosedFormPeriodMap(Model(p)).to_state(orbits.unstable.x)
+            state = orbits.unstable.period_map.to_state(orbits.unstable.x)
             motion = resonance.case.simulator.simulate_motion(
                 resonance.hz, resonance.case.acceleration, state, 1
             )

@@ -13,11 +13,13 @@ from typing import final
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from twin.model import closed_form, periodic_orbit
+from twin.dynamics.closed_form_map import ClosedFormMap
+from twin.model import closed_form
 from twin.model.contact_regime import CONTACT_L, CONTACT_R
 from twin.model.event_integrator_kernel import DIRECTION, STATE_F
 from twin.model.model import Model
 from twin.model.parameters import Parameters
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT, Solver
 from twin.model.stepped_sine import EXTREME_NAMES, SteppedSineResponse, simulate_stepped_sine
 
@@ -153,16 +155,17 @@ class ClosedFormSimulator(HarmonicSimulator):
     def find_onsets(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> tuple[Float1D, Float1D, Float1D]:
-        return periodic_orbit.contact_onset_times(
-            self.parameters, frequency_hz, acceleration, state, cycles
-        )
+        period_map = ClosedFormMap(self.model, frequency_hz, acceleration)
+        events, end = period_map.find_contacts(state.take(period_map.indices), cycles)
+        right, left = (events[(events[:, 1] == side) & (events[:, 2] == 1), 0] for side in (0, 1))
+        return right, left, period_map.to_state(end)
 
     def lyapunov_exponent(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> tuple[float, Float1D]:
-        return periodic_orbit.lyapunov_exponent(
-            self.parameters, frequency_hz, acceleration, state, cycles
-        )
+        period_map = ClosedFormMap(self.model, frequency_hz, acceleration)
+        growth, end = period_map.measure_growth(state.take(period_map.indices), cycles)
+        return float(growth.mean()), period_map.to_state(end)
 
 
 @final
@@ -187,7 +190,7 @@ class NumericalSimulator(HarmonicSimulator):
         )
         out = np.empty((OUTPUT_COUNT, wave.size))
         table = -acceleration / (2 * math.pi * frequency_hz) ** 2 * wave
-        prepare_solver(self.model, samples_per_cycle * frequency_hz).advance(
+        prepare_cached(self.model, samples_per_cycle * frequency_hz).advance(
             state, acceleration * wave, table, out
         )
         return out
@@ -206,7 +209,7 @@ class NumericalSimulator(HarmonicSimulator):
         state: Float1D | None = None,
     ) -> SteppedSineResponse:
         current = (
-            prepare_solver(self.model, self._samples(1.0)).rest_state()
+            prepare_cached(self.model, self._samples(1.0)).rest_state()
             if state is None
             else state.copy()
         )
@@ -263,9 +266,9 @@ class NumericalSimulator(HarmonicSimulator):
 
 
 @lru_cache(64)
-def prepare_solver(model: Model, rate_hz: float) -> Solver:
+def prepare_cached(model: Model, rate_hz: float) -> Solver:
     """Return the solver of a model at a rate; cached because the preparation is costly."""
-    return model.prepare(rate_hz)
+    return prepare_solver(model, rate_hz)
 
 
 def _renormalize(reference: Float1D, neighbour: Float1D, ratio: float) -> Float1D:

@@ -23,9 +23,10 @@ from table_io.sequencer import FEEDBACK_HORIZON_S, make_test_plan
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.arclength import NoConvergence, correct, weighted_length
 from twin.dynamics.continuation import Branch, continue_branch, make_problem, orbit_weights
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.linearized_orbit import LinearizedOrbit, find_harmonics
 from twin.dynamics.orbits import Orbit, settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY, PeriodMap, make_period_map
+from twin.dynamics.period_map import FREQUENCY, LEVEL, PeriodMap
 from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming, interpolate_gains
 from twin.setup.phase_resonance import find_phase_resonance, find_resonance_approach
@@ -98,9 +99,9 @@ def make_orbit_plan(
     `points` unstable orbits, evenly spaced along the branch, and LEAD_ORBITS stable ones on either
     side. InputError if there are none, or if the latency is too large, with the largest allowed.
     """
-    period_map = make_period_map(model)
-    stretch = find_unstable_stretch(period_map, range_hz, acceleration_m_s2)
-    variants = _find_variants(period_map, range_hz, acceleration_m_s2)
+    period_map = make_period_map(model, range_hz[1], acceleration_m_s2)
+    stretch = find_unstable_stretch(period_map, range_hz)
+    variants = _find_variants(period_map, range_hz)
     positions = stretch.divide(range_hz, points)
     orbits = [stretch.orbit_at(position) for position in positions]
 
@@ -133,15 +134,13 @@ def _plan_orbit(orbit: Orbit, gains: tuple[float, float]) -> PlannedOrbit:
     )
 
 
-def find_unstable_stretch(
-    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
-) -> UnstableStretch:
+def find_unstable_stretch(period_map: PeriodMap, range_hz: tuple[float, float]) -> UnstableStretch:
     """Return the longest unstable part between folds in a frequency range, with its surroundings.
 
     The branch is that of the orbit to which rest settles above the range. InputError without one.
     """
     low_hz, high_hz = range_hz[0] / RANGE_MARGIN, range_hz[1] * RANGE_MARGIN
-    start = settle_to_orbit(period_map, high_hz, acceleration_m_s2)
+    start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
     if start is None:
         raise InputError(
             f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz",
@@ -227,14 +226,12 @@ def _vary_parameters(period_map: PeriodMap) -> list[PeriodMap]:
     ]
 
 
-def _find_variants(
-    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
-) -> list[UnstableStretch]:
+def _find_variants(period_map: PeriodMap, range_hz: tuple[float, float]) -> list[UnstableStretch]:
     """Return the unstable parts of models with errors of mass and stiffness, where they exist."""
     variants = []
     for varied in _vary_parameters(period_map):
         try:
-            variants.append(find_unstable_stretch(varied, range_hz, acceleration_m_s2))
+            variants.append(find_unstable_stretch(varied, range_hz))
         except InputError:
             continue
     return variants
@@ -247,10 +244,12 @@ def make_backbone_plan(
 
     InputError if a level has none in the range, or if the latency is too large.
     """
-    period_map = make_period_map(model)
-    *leads, first = find_resonance_approach(period_map, range_hz, float(levels_m_s2[0]))
+    levels = levels_m_s2.tolist()
+    period_map = make_period_map(model, range_hz[1], levels[0])
+    *leads, first = find_resonance_approach(period_map, range_hz)
     orbits = [first] + [
-        find_phase_resonance(period_map, range_hz, level) for level in levels_m_s2[1:].tolist()
+        find_phase_resonance(period_map.with_parameter(LEVEL, level), range_hz)
+        for level in levels[1:]
     ]
     variants = _vary_parameters(period_map)
 
@@ -258,7 +257,8 @@ def make_backbone_plan(
         listed = [orbits[station]]
         for variant in variants:
             try:
-                listed.append(find_phase_resonance(variant, range_hz, float(levels_m_s2[station])))
+                varied = variant.with_parameter(LEVEL, levels[station])
+                listed.append(find_phase_resonance(varied, range_hz))
             except InputError:  # beyond the range
                 continue
         return listed

@@ -19,28 +19,24 @@ MAX_BISECTIONS = 40
 LEAD_RATIO = 1.04  # of the frequencies of two orbits on the way from rest to the resonance
 
 
-def find_phase_resonance(
-    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
-) -> Orbit:
+def find_phase_resonance(period_map: PeriodMap, range_hz: tuple[float, float]) -> Orbit:
     """Return the largest orbit in phase resonance within a frequency range, at one level.
 
     The branch is that of the orbit to which rest settles above the range. InputError without one,
     with the phases of the branch in the range.
     """
-    return find_resonance_approach(period_map, range_hz, acceleration_m_s2)[-1]
+    return find_resonance_approach(period_map, range_hz)[-1]
 
 
-def find_resonance_approach(
-    period_map: PeriodMap, range_hz: tuple[float, float], acceleration_m_s2: float
-) -> list[Orbit]:
+def find_resonance_approach(period_map: PeriodMap, range_hz: tuple[float, float]) -> list[Orbit]:
     """Return orbits from below all folds up to the one in phase resonance, which is the last.
 
     From rest the first is reached without any other solution to fall to; where the branch has no
     fold the resonance alone is returned. InputError as in `find_phase_resonance`.
     """
     high_hz = range_hz[1] * RANGE_MARGIN
-    start = settle_to_orbit(period_map, high_hz, acceleration_m_s2)
-    level_g = acceleration_m_s2 / GRAVITY_M_S2
+    start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
+    level_g = period_map.acceleration_m_s2 / GRAVITY_M_S2
     if start is None:
         raise InputError(
             f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz and "

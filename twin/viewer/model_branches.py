@@ -13,8 +13,8 @@ from table_io.records import PrcPoint, RunStart
 from twin.dynamics.attractors import Attractor
 from twin.dynamics.basins import StartGrid, compute_basins
 from twin.dynamics.continuation import Branch, split_by_stability
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.main_branches import follow_sweep_branches
-from twin.dynamics.stroboscopic import OperatingPoint
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.model.parameters import free_flight_resonance
@@ -118,7 +118,7 @@ class ModelBranches:
         grid = StartGrid.from_limits(
             u_limit, u_limit * 2 * math.pi * frequency_hz, BASIN_STARTS, BASIN_STARTS
         )
-        basins = compute_basins(OperatingPoint(self.model, frequency_hz, self.level_m_s2), grid)
+        basins = compute_basins(make_period_map(self.model, frequency_hz, self.level_m_s2), grid)
         shares = [
             share
             for attractor, share in zip(basins.attractors, basins.fractions, strict=True)

@@ -12,8 +12,9 @@ from table_io.units import GRAVITY_M_S2
 from twin.branches.page import make_page_data, write_branch_report
 from twin.drawing.branch_curves import BranchSet, make_axis
 from twin.dynamics.continuation import Branch, continue_branch, split_by_stability
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.orbits import settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, make_period_map
+from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL
 from twin.setup.run_config import read_run_config
 
 LIMITS_HZ = (2.5, 4.5)
@@ -25,7 +26,7 @@ BAND_HZ = (2.55, 2.6)  # not real: only to see it drawn
 def branch() -> Branch:
     """Branch of G4 through its right hysteresis: stable, unstable, stable."""
     model = read_run_config(PROFILES_DIR / "tests" / "g4_ss3.toml").model
-    start = settle_to_orbit(make_period_map(model), LIMITS_HZ[1], LEVEL_M_S2)
+    start = settle_to_orbit(make_period_map(model, LIMITS_HZ[1], LEVEL_M_S2))
     assert start is not None
     return continue_branch(start, FREQUENCY, LIMITS_HZ)
 

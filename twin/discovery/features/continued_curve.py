@@ -12,8 +12,9 @@ from twin.compare.curves import MIN_BRANCH_DIFFERENCE
 from twin.discovery.features.config import FeatureTest
 from twin.discovery.features.curve import MIN_EXCESS_M, ResponseCurve, join_directions
 from twin.dynamics.continuation import continue_branch
+from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.orbits import Orbit, settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY, make_period_map
+from twin.dynamics.period_map import FREQUENCY
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 
@@ -58,7 +59,7 @@ def compute_curve(model: Model, test: FeatureTest) -> ResponseCurve | None:
     """
     limits = find_curve_limits(model, test)
     try:
-        orbit = settle_to_orbit(make_period_map(model), limits[1], test.acceleration_m_s2)
+        orbit = settle_to_orbit(make_period_map(model, limits[1], test.acceleration_m_s2))
         branch = continue_branch(orbit, FREQUENCY, limits, -1) if orbit else None
     except InputError:  # the model cannot be solved with these parameters
         return None

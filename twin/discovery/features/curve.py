@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D
-from twin.dynamics.resonance_map import locate_peak
+from twin.dynamics.main_branches import locate_peak
 
 Bool1D = npt.NDArray[np.bool_]
 CurveMethod = Literal["describing functions", "continuation", "stepped sweeps"]

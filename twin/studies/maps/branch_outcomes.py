@@ -9,8 +9,8 @@ import numpy.typing as npt
 from twin.compare.curves import FloatND
 from twin.dynamics.basins import StartGrid, compute_basins
 from twin.dynamics.continuation import Branch
-from twin.dynamics.resonance_map import find_peaks
-from twin.dynamics.stroboscopic import OperatingPoint
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.main_branches import find_peaks
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
 
@@ -75,8 +75,9 @@ def measure_basins(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
         grid = StartGrid.from_limits(
             1e-3 * settings["basins.disp_mm"], settings["basins.vel_m_s"], side, side
         )
-        point = OperatingPoint(case.model, settings["basins.frequency_hz"], case.acceleration_m_s2)
-        basins = compute_basins(point, grid)
+        frequency_hz = settings["basins.frequency_hz"]
+        period_map = make_period_map(case.model, frequency_hz, case.acceleration_m_s2)
+        basins = compute_basins(period_map, grid)
         in_contact = np.array([attractor.has_contact for attractor in basins.attractors])
         shares = basins.fractions
         return np.array(

@@ -33,6 +33,7 @@ from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 from twin.model.valid_range import find_range_exits
 from twin.system.process_pool import Workers
@@ -291,7 +292,7 @@ def measure_curve_error(model: Model, signals: StudySignals) -> float:
     steady = list_steady_samples(signals)
     if len(steady) < MIN_STEPS:
         return math.nan
-    solver = model.prepare(PROFILE.acquisition.rate_hz)
+    solver = prepare_solver(model, PROFILE.acquisition.rate_hz)
     base_acc, table_disp = (
         np.ascontiguousarray(signals.channels[name]) for name in ("table_acc_m_s2", "table_disp_m")
     )

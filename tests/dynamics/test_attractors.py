@@ -1,4 +1,4 @@
-"""Attractors, basins of attraction and their sizes: figures of the SNM, and full-length runs."""
+"""Attractors, basins and brute-force diagrams: figures of the SNM, and full-length runs."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -8,18 +8,25 @@ import pytest
 
 from table_io.errors import InputError
 from tests.model.reference import AG, snm
-from twin.dynamics.attractors import AttractorSearch, find_attractors
-from twin.dynamics.basins import StartGrid, compute_basins, compute_basins_over
-from twin.dynamics.stroboscopic import OperatingPoint, make_stroboscopic_map
+from twin.dynamics.attractors import AttractorSearch, estimate_exponent
+from twin.dynamics.basins import (
+    StartGrid,
+    compute_basins,
+    compute_basins_over,
+    find_chaotic_bands,
+    follow_attractor,
+    record_section,
+)
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.period_map import PeriodMap
 from twin.model.model import Model
-from twin.model.stepped_sine import simulate_stepped_sine
 
 G4 = Model(snm())
 GRID = StartGrid.from_limits(6e-3, 0.15, 21, 21)
 
 
-def at(frequency: float, model: Model = G4) -> OperatingPoint:
-    return OperatingPoint(model, frequency, AG)
+def at(frequency: float, model: Model = G4) -> PeriodMap:
+    return make_period_map(model, frequency, AG)
 
 
 def classify_in_full(basins, cycles: int) -> np.ndarray:
@@ -27,25 +34,19 @@ def classify_in_full(basins, cycles: int) -> np.ndarray:
 
     Without capture, and by another kernel.
     """
-    stroboscopic = make_stroboscopic_map(basins.point)
-    want = []
-    for attractor in basins.attractors:
-        # a copy: the motion of the attractor over as many cycles as are compared
-        ends = simulate(basins.point, attractor.points[-1], 320)[-320:]
-        want.append(summarize(ends))
+    period_map = basins.period_map
+    # over as many cycles as are compared
+    want = [summarize(simulate(period_map, a.points[-1], 320)) for a in basins.attractors]
     labels = []
-    for state in basins.grid.make_states(stroboscopic):
-        ends = summarize(simulate(basins.point, state, cycles)[-320:])
+    for x in basins.grid.list_starts(period_map):
+        ends = summarize(simulate(period_map, x, cycles)[-320:])
         labels.append(int(np.argmin([np.abs(ends - each).max() for each in want])))
     return np.array(labels).reshape(basins.grid.shape)
 
 
-def simulate(point: OperatingPoint, state, cycles: int) -> np.ndarray:
+def simulate(period_map: PeriodMap, x, cycles: int) -> np.ndarray:
     """u_max and u_min of each cycle, (cycles, 2)."""
-    sweep = simulate_stepped_sine(
-        point.model.parameters, [point.frequency_hz], point.acceleration_m_s2, cycles, state=state
-    )
-    return sweep.extremes[0, :, :2]
+    return period_map.measure_periods(x, cycles)[:, :2]
 
 
 def summarize(extremes: np.ndarray) -> np.ndarray:
@@ -113,7 +114,7 @@ def test_periods_of_several_cycles(frequency, period, count):
     assert [a.period for a in attractors] == [period] * count
     for attractor in attractors:
         assert len(attractor.points) == len(attractor.extremes) == period
-        again = make_stroboscopic_map(at(frequency)).advance(attractor.points[-1].copy(), period)
+        again = at(frequency).record(attractor.points[-1], period)
         assert again[:, :2] == pytest.approx(attractor.points[:, :2], abs=1e-10)
 
 
@@ -122,9 +123,10 @@ def test_periods_of_several_cycles(frequency, period, count):
     [(0.53, 0.6099, 12e-4), (0.71, 0.7365, 9e-4), (1.1, 0.6110, 25e-4), (1.4, 0.3276, 3e-4)],
 )
 def test_exponents_of_the_chaotic_attractors(frequency, want, error):
-    stroboscopic = make_stroboscopic_map(at(frequency))
-    states = StartGrid.from_limits(2e-3, 0.05, 2, 2).make_states(stroboscopic)
-    for attractor in find_attractors(stroboscopic, states, 20000):
+    search = AttractorSearch(at(frequency), 20000)
+    search.classify(StartGrid.from_limits(2e-3, 0.05, 2, 2).list_starts(at(frequency)))
+    assert search.attractors
+    for attractor in search.attractors:
         exponent = attractor.exponent
         assert attractor.kind == "chaotic"
         assert exponent.is_positive
@@ -132,14 +134,17 @@ def test_exponents_of_the_chaotic_attractors(frequency, want, error):
         assert abs(exponent.value - want) < 4 * math.hypot(exponent.standard_error, error)
 
 
-def test_the_standard_error_is_that_of_repeated_estimates():
-    stroboscopic = make_stroboscopic_map(at(0.71))
-    state = stroboscopic.make_state(1e-3, 0.0)
-    stroboscopic.advance(state, 500)
-    growth = stroboscopic.measure_growth(state, 40000).reshape(20, -1)
-    scatter = growth.mean(axis=1).std(ddof=1)
-    (attractor,) = find_attractors(stroboscopic, state[None], 2000)
-    assert attractor.exponent.standard_error == pytest.approx(scatter, rel=0.6)
+def test_standard_error_of_an_exponent_is_that_of_repeated_estimates():
+    period_map = at(0.71)
+    x = period_map.iterate(period_map.start(1e-3, 0.0), 500)
+    growth, _ = period_map.measure_growth(x, 40000)
+    scatter = growth.reshape(20, -1).mean(axis=1).std(ddof=1)
+    assert estimate_exponent(period_map, x, 2000).standard_error == pytest.approx(scatter, rel=0.6)
+    regular = at(2.4)
+    settled = regular.iterate(regular.start(1e-3, 0.0), 1000)
+    exponent = estimate_exponent(regular, settled, 4000)
+    assert exponent.is_negative
+    assert not exponent.is_positive
 
 
 def test_linear_flight_has_a_single_basin():
@@ -233,10 +238,79 @@ def test_basins_over_any_parameter(parameter, values):
 
 
 def test_an_attractor_met_again_is_the_same():
-    stroboscopic = make_stroboscopic_map(at(3.4))
-    search = AttractorSearch(stroboscopic)
-    first, _ = search.classify(GRID.make_states(stroboscopic))
-    second, cycles = search.classify(GRID.make_states(stroboscopic))
+    search, starts = AttractorSearch(at(3.4)), GRID.list_starts(at(3.4))
+    first, _ = search.classify(starts.copy())
+    second, cycles = search.classify(starts)
     assert len(search.attractors) == 2
     assert (first == second).all()
     assert cycles.max() < 16
+
+
+@pytest.mark.slow
+def test_the_chaotic_bands_of_g4():
+    """1.07 to 1.17, 1.19 to 1.22 and 1.23 to 1.41 Hz."""
+    frequencies = np.arange(1055, 1430, 10) / 1000
+    up = follow_attractor(at(1.2), "frequency", frequencies, 1000)
+    down = follow_attractor(at(1.2), "frequency", frequencies[::-1], 1000)
+    bands = find_chaotic_bands([up, down], 1e-3)
+    ends = [(band.low, band.high) for band in bands]
+    assert ends == [
+        pytest.approx(want, abs=4e-3) for want in ((1.066, 1.170), (1.190, 1.221), (1.226, 1.4135))
+    ]
+    assert all(band.exponent.is_positive for band in bands)
+
+
+def test_a_band_that_reaches_the_end_of_the_diagram_ends_there():
+    up = follow_attractor(at(1.2), "frequency", [1.10, 1.11, 1.12], 500)
+    (band,) = find_chaotic_bands([up], 1e-3)
+    assert (band.low, band.high) == (1.10, 1.12)
+
+
+def test_the_state_is_carried_through_the_hysteresis():
+    frequencies = np.arange(270, 421, 5) / 100
+    up = follow_attractor(at(1.2), "frequency", frequencies)
+    down = follow_attractor(at(1.2), "frequency", frequencies[::-1])
+    impacting = [
+        {
+            round(float(f), 3)
+            for f, (a,) in zip(d.values, d.attractors, strict=True)
+            if a.has_contact
+        }
+        for d in (up, down)
+    ]
+    assert max(impacting[0]) == pytest.approx(4.0273, abs=0.05)
+    assert max(impacting[1]) == pytest.approx(2.7873, abs=0.05)
+
+
+def test_over_the_gap_the_impacts_end_at_the_fold():
+    """At 3.4 Hz: grazing at 2.4938 mm (decreasing gap), fold at 7.9502 mm (increasing gap)."""
+    period_map = at(3.4, Model(snm(2e-3)))
+    gaps = np.arange(200, 851, 10, dtype=np.float64) * 1e-5
+    ends = []
+    for values in (gaps, gaps[::-1]):
+        diagram = follow_attractor(period_map, "gap", values)
+        contacts = [a.has_contact for (a,) in diagram.attractors]
+        ends.append(max(np.compress(contacts, diagram.values)))
+    assert ends == pytest.approx([7.9502e-3, 2.4938e-3], abs=1e-4)
+
+
+def test_a_subharmonic_of_small_basin_is_found():
+    """4.55 Hz: period 6, a doubled period 3, beside the motion without contact."""
+    basins = compute_basins(at(4.55), StartGrid.from_limits(6e-3, 0.15, 25, 25))
+    assert basins.undecided_share == 0
+    assert {attractor.period for attractor in basins.attractors} == {1, 6}
+
+
+def test_a_section_lies_on_the_attractor():
+    points = record_section(at(1.1), 1e-3, 0.0, 3000)
+    assert points.shape == (3000, 2)
+    assert np.unique(np.round(points, 9), axis=0).shape[0] > 2900
+    periodic = record_section(at(1.18), 1e-3, 0.0, 50)
+    assert np.unique(np.round(periodic, 7), axis=0).shape[0] == 5
+
+
+def test_diagrams_over_different_values_have_no_common_bands():
+    first = follow_attractor(at(1.2), "frequency", [2.0])
+    with pytest.raises(InputError) as error:
+        find_chaotic_bands([first, follow_attractor(at(1.2), "frequency", [2.1])], 1e-3)
+    assert error.value.key == "diagrams"

@@ -8,15 +8,17 @@ import pytest
 from table_io.config.base import PROFILES_DIR
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.continuation import continue_branch
-from twin.dynamics.main_branches import follow_main_branches, follow_sweep_branches
-from twin.dynamics.orbits import settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY, GAP, make_period_map
-from twin.dynamics.resonance_map import (
+from twin.dynamics.event_driven_map import make_period_map
+from twin.dynamics.main_branches import (
     ResonanceMap,
     compute_resonance_map,
     find_peaks,
+    follow_main_branches,
+    follow_sweep_branches,
     half_swings,
 )
+from twin.dynamics.orbits import settle_to_orbit
+from twin.dynamics.period_map import FREQUENCY, GAP
 from twin.model.model import Model
 from twin.model.stepped_sine import simulate_stepped_sine
 from twin.setup.run_config import read_run_config
@@ -25,16 +27,17 @@ LEVEL_M_S2 = 0.05 * GRAVITY_M_S2
 LIMITS_HZ = (1.8, 6.0)
 GAPS_M = (0.002, 0.004, 0.01)
 MODEL = read_run_config(PROFILES_DIR / "tests" / "g4_ss3.toml").model
+PERIOD_MAP = make_period_map(MODEL, LIMITS_HZ[1], LEVEL_M_S2)
 
 
 @pytest.fixture(scope="module")
 def resonance() -> ResonanceMap:
-    return compute_resonance_map(make_period_map(MODEL), GAP, GAPS_M, LIMITS_HZ, LEVEL_M_S2)
+    return compute_resonance_map(PERIOD_MAP, GAP, GAPS_M, LIMITS_HZ)
 
 
 @pytest.mark.parametrize("index", range(len(GAPS_M)))
 def test_the_peaks_are_those_of_a_slow_sweep(resonance: ResonanceMap, index: int) -> None:
-    period_map = make_period_map(MODEL).with_parameter(GAP, GAPS_M[index])
+    period_map = PERIOD_MAP.with_parameter(GAP, GAPS_M[index])
     peaks = resonance.peaks
     frequencies = np.arange(1.8, peaks.u_hz[index] + 0.05, 0.005)
     sweep = simulate_stepped_sine(period_map.model.parameters, frequencies, LEVEL_M_S2, 60)
@@ -48,9 +51,7 @@ def test_the_peaks_are_those_of_a_slow_sweep(resonance: ResonanceMap, index: int
 def test_the_loci_pass_the_bifurcations_of_another_gap(resonance: ResonanceMap) -> None:
     """Folds and grazing at 6 mm, which is not among the gaps of the map."""
     gap_m = 0.006
-    start = settle_to_orbit(
-        make_period_map(MODEL).with_parameter(GAP, gap_m), LIMITS_HZ[1], LEVEL_M_S2
-    )
+    start = settle_to_orbit(PERIOD_MAP.with_parameter(GAP, gap_m))
     assert start is not None
     branch = continue_branch(start, FREQUENCY, LIMITS_HZ)
     bifurcations = branch.of_kind("fold", "grazing")
@@ -73,14 +74,12 @@ def sorted_pair(pair: np.ndarray) -> np.ndarray:
 
 def test_a_peak_outside_of_the_range_is_unknown() -> None:
     """The resonance of a wide gap lies below 1.3 Hz."""
-    resonance = compute_resonance_map(
-        make_period_map(MODEL), GAP, (0.1, 0.2), (2.0, 3.0), LEVEL_M_S2
-    )
+    resonance = compute_resonance_map(PERIOD_MAP, GAP, (0.1, 0.2), (2.0, 3.0))
     assert np.isnan(resonance.peaks.u_m).all()
 
 
 def test_the_main_branch_of_g4_holds_the_three_solutions_at_3_4_hz() -> None:
-    branches = follow_main_branches(make_period_map(MODEL), LIMITS_HZ, LEVEL_M_S2)
+    branches = follow_main_branches(PERIOD_MAP, LIMITS_HZ)
     orbits = [orbit for branch in branches for orbit in branch.orbits_at(3.4)]
     amplitudes_mm = sorted(500 * (orbit.u_max - orbit.u_min) for orbit in orbits)
     assert amplitudes_mm == pytest.approx([1.247, 3.297, 5.123], abs=1e-3)
