@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import brentq
-from twin.dynamics.stroboscopic import OperatingPoint, make_stroboscopic_map
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
@@ -22,7 +21,7 @@ from tests.model.reference import snm
 from tests.plugin_package import install_package
 from twin.discovery.discover import discover_effects
 from twin.discovery.parameters import EffectKey
-from twin.dynamics.period_map import make_period_map
+from twin.dynamics.event_driven_map import make_period_map
 from twin.laws.checks import check_effect
 from twin.laws.effect import Effect, EffectParameter, State
 from twin.laws.effect_file import EffectFile
@@ -139,10 +138,9 @@ class TestInstalled:
         assert solver.rest_state(0)[0] == 0.0
         expected = -80.0 * 0.5 / model.parameters.stiffness
         assert solver.rest_state(round(0.5 * RATE_HZ))[0] == pytest.approx(expected, rel=1e-12)
-        for make in (make_period_map, lambda m: make_stroboscopic_map(OperatingPoint(m, 3.0, 0.5))):
-            with pytest.raises(InputError) as error:
-                make(model)
-            assert "pulling_cable" in error.value.where
+        with pytest.raises(InputError) as error:
+            make_period_map(model, 3.0, 0.5)
+        assert "pulling_cable" in error.value.where
 
     @pytest.mark.parametrize("size", [1, 7, 64, 500])
     def test_blocks_of_any_size_give_the_same_bits(self, size):

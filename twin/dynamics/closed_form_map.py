@@ -44,11 +44,11 @@ from twin.model.contact_regime import (
     STATE_SIZE,
     U_R,
     Kinematics,
+    ModeSegment,
     ModeSolution,
+    ModeStep,
     Quantity,
-    Segment,
     Sinusoid,
-    Step,
     U,
     V,
     contact_guard,
@@ -255,7 +255,7 @@ def find_guard_minimum(
 
 
 @jit_helper()
-def record_minima(record: Variations, params: Float1D, begin: float, segment: Segment) -> None:
+def record_minima(record: Variations, params: Float1D, begin: float, segment: ModeSegment) -> None:
     """Append the minima of both guards in a segment that begins at `begin` s."""
     mode, _, dt, event_side, faces, m, x0, x1 = segment
     minima, progress = record.minima, record.progress
@@ -277,7 +277,7 @@ def record_minima(record: Variations, params: Float1D, begin: float, segment: Se
 
 @jit_helper()
 def vary_by_segment(
-    record: Variations, count: int, state: Float1D, params: Float1D, segment: Segment
+    record: Variations, count: int, state: Float1D, params: Float1D, segment: ModeSegment
 ) -> int:
     """Carry variations through the event of a segment; return the number of events."""
     mode, t, dt, side, _, m, _, _ = segment
@@ -309,7 +309,7 @@ def accept_without_minimum(
     wave: Sinusoid,
     start: tuple[float, float],
     mode: int,
-    step: Step,
+    step: ModeStep,
 ) -> bool:
     """Return whether no guard has a minimum within a step; see `stepped_sine.Recorder`."""
     _, _, _, right0, right1 = step.right
@@ -455,7 +455,7 @@ def capture_points(
                 break
 
 
-class _Prepared(NamedTuple):
+class _ClosedFormConstants(NamedTuple):
     """What a map needs of the parameters: for the kernels, and by coordinate."""
 
     params: Float1D
@@ -465,7 +465,7 @@ class _Prepared(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _prepare(p: Parameters) -> _Prepared:
+def _make_constants(p: Parameters) -> _ClosedFormConstants:
     """Return what the maps of a model at all frequencies and levels have in common."""
     sides = (p.bumper_damping_r, p.gap_r), (p.bumper_damping_l, p.gap_l)
     memory = [
@@ -476,7 +476,9 @@ def _prepare(p: Parameters) -> _Prepared:
     scales = np.ones(2 + len(memory))
     scales[V] = math.sqrt(p.stiffness / p.mass)
     params = continuous_params(p)
-    return _Prepared(params, highest_angular_frequency(params), np.array([U, V, *memory]), scales)
+    return _ClosedFormConstants(
+        params, highest_angular_frequency(params), np.array([U, V, *memory]), scales
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -487,20 +489,20 @@ class ClosedFormMap(PeriodMap):
     """
 
     @cached_property
-    def _prepared(self) -> _Prepared:
-        return _prepare(self.model.parameters)
+    def _constants(self) -> _ClosedFormConstants:
+        return _make_constants(self.model.parameters)
 
     @property
     def indices(self) -> Sequence[int]:
-        return self._prepared.indices.tolist()
+        return self._constants.indices.tolist()
 
     @property
     def size(self) -> int:
-        return self._prepared.indices.size
+        return self._constants.indices.size
 
     @property
     def scales(self) -> Float1D:
-        return self._prepared.scales
+        return self._constants.scales
 
     @property
     def derivatives(self) -> tuple[str, ...]:
@@ -511,7 +513,7 @@ class ClosedFormMap(PeriodMap):
     @cached_property
     def _inputs(self) -> tuple[Int1D, Float1D, SineDrive]:
         """Indices, parameters and drive, of which the kernels fill in what depends on the drive."""
-        params, highest_w, indices, _ = self._prepared
+        params, highest_w, indices, _ = self._constants
         phase_step = highest_w / (self.frequency_hz * STEPS_PER_CYCLE)
         steps = STEPS_PER_CYCLE * max(1, math.ceil(phase_step / MAX_PHASE_STEP_RAD))
         table, particular = np.empty((2, steps + 1)), np.empty((4, 3))
@@ -521,7 +523,7 @@ class ClosedFormMap(PeriodMap):
 
     def to_state(self, x: Float1D) -> Float1D:
         state = np.empty(STATE_SIZE)
-        place_state(state, x, self._prepared.indices, self._prepared.params)
+        place_state(state, x, self._constants.indices, self._constants.params)
         return state
 
     def evaluate(self, x: Float1D, periods: int = 1) -> MapResult:
@@ -535,7 +537,7 @@ class ClosedFormMap(PeriodMap):
         if np.count_nonzero(at_once) > MAX_CHATTER:
             variations[:] = math.nan
             state[:] = math.nan
-        indices, stop = self._prepared.indices, n + len(self.derivatives)
+        indices, stop = self._constants.indices, n + len(self.derivatives)
         derivatives = variations.take(indices, axis=0)
         codes = [4 + side + 2 * onset for _, side, onset in events[:event_count].tolist()]
         return MapResult(
@@ -557,7 +559,7 @@ class ClosedFormMap(PeriodMap):
         return points[0]
 
     def rest(self) -> Float1D:
-        return rest_state(self.model.parameters).take(self._prepared.indices)
+        return rest_state(self.model.parameters).take(self._constants.indices)
 
     def measure_periods(self, x: Float1D, periods: int) -> Float2D:
         return simulate_stepped_sine(
@@ -582,7 +584,7 @@ class ClosedFormMap(PeriodMap):
         variation[: V + 1, 0] = 1.0
         state = np.empty(STATE_SIZE)
         advance_variations(x, *self._inputs, periods, state, variation, growth, _NO_ROWS, _NO_ROWS)
-        return growth, state.take(self._prepared.indices)
+        return growth, state.take(self._constants.indices)
 
     def find_contacts(self, x: Float1D, periods: int) -> tuple[Float2D, Float1D]:
         """Return (contact events (n, 3) in order of time, the coordinates at the end).
@@ -594,7 +596,7 @@ class ClosedFormMap(PeriodMap):
         _, count, _ = advance_variations(
             x, *self._inputs, periods, state, variation, growth, events, _NO_ROWS
         )
-        return events[:count], state.take(self._prepared.indices)
+        return events[:count], state.take(self._constants.indices)
 
     def capture(
         self,

@@ -70,7 +70,7 @@ class SampledDrive(NamedTuple):
     added_acc: Float1D  # m/s2, the part of it that is not the table's acceleration
 
 
-class _Prepared(NamedTuple):
+class _IntegratedConstants(NamedTuple):
     """What the maps of a model have in common; a linear model too is integrated.
 
     The exact propagators of a linear model cost more than the few periods that they serve.
@@ -84,7 +84,7 @@ class _Prepared(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def _prepare(model: Model) -> _Prepared:
+def _make_constants(model: Model) -> _IntegratedConstants:
     """Return what the maps of a model at all frequencies and levels have in common."""
     coefficients, laws = kernel_coefficients(model)
     p, added = model.parameters, model.added_laws
@@ -109,7 +109,7 @@ def _prepare(model: Model) -> _Prepared:
     count = sum(len(PLACES[effect.place]) * len(effect.states) for effect, _ in added)
     indices += range(STATE_S, STATE_S + count)
     linear = coefficients._replace(is_linear=False)
-    return _Prepared(linear, laws, sum_law_properties(added), indices)
+    return _IntegratedConstants(linear, laws, sum_law_properties(added), indices)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,12 +117,12 @@ class EventDrivenMap(PeriodMap):
     """Map of a model with any effects that do not change with time."""
 
     @cached_property
-    def _prepared(self) -> _Prepared:
-        return _prepare(self.model)
+    def _constants(self) -> _IntegratedConstants:
+        return _make_constants(self.model)
 
     @property
     def indices(self) -> Sequence[int]:
-        return self._prepared.indices
+        return self._constants.indices
 
     @cached_property
     def scales(self) -> Float1D:
@@ -132,7 +132,7 @@ class EventDrivenMap(PeriodMap):
 
     def _scale(self, u: float, v: float, w: float) -> Float1D:
         """Return the size of each coordinate, (size,), in a motion of u m, v m/s at w 1/s."""
-        coefficients = self._prepared.coefficients
+        coefficients = self._constants.coefficients
         sizes = np.full(STATE_SIZE, u)
         sizes[V], sizes[STATE_F], sizes[STATE_Z] = v, coefficients.k1 * u, u / coefficients.uy
         sizes[STATE_B_R : STATE_B_R + 2] = coefficients.kb * u
@@ -163,9 +163,9 @@ class EventDrivenMap(PeriodMap):
         With as many substeps as at the frequency `stepped_hz`, if given: they change with the
         frequency, a difference must not.
         """
-        prepared, f = self._prepared, self.frequency_hz
+        constants, f = self._constants, self.frequency_hz
         rate_hz = samples / periods * (stepped_hz or f) / STEP_REFINEMENT
-        coefficients = set_substeps(prepared.coefficients, rate_hz, prepared.law_properties)
+        coefficients = set_substeps(constants.coefficients, rate_hz, constants.law_properties)
         period_s = periods / (samples * f)
         coefficients = coefficients._replace(period=period_s, step=period_s / coefficients.substeps)
         phases = 2 * math.pi * periods * np.arange(1, samples + 1) / samples
@@ -188,12 +188,12 @@ class EventDrivenMap(PeriodMap):
         out (7, samples): `closed_form.OUTPUT_NAMES` of the last row. A row that becomes infinite
         is NaN. events (k, 4) as in `integrate_samples`; their number, both of the last row.
         """
-        integrate, count = build_kernel(self._prepared.laws is not None), 0
+        integrate, count = build_kernel(self._constants.laws is not None), 0
         base = np.resize(drive.base_acc, samples)
         for state in states:
             state[STATE_BASE] = drive.base_acc[-1]
             count = integrate(
-                state, drive.coefficients, _NO_PROPAGATORS, self._prepared.laws, base, out, events
+                state, drive.coefficients, _NO_PROPAGATORS, self._constants.laws, base, out, events
             )
             if not math.isfinite(state[U]):
                 state[:] = math.nan
@@ -226,7 +226,7 @@ class EventDrivenMap(PeriodMap):
             face[contact] = sign * depth[contact]
         np.clip(z, -MAX_HYSTERESIS, MAX_HYSTERESIS, out=z)
         direction = np.where(v < 0, -1.0, 1.0)
-        if self._prepared.coefficients.fc > 0:
+        if self._constants.coefficients.fc > 0:
             is_stuck = np.abs(v) <= STICK_TOL_M_S
             v[is_stuck] = direction[is_stuck] = 0.0
         states[:, DIRECTION] = direction
@@ -234,7 +234,7 @@ class EventDrivenMap(PeriodMap):
 
     def _contact_rate(self, side: int, depth: Float1D) -> Float1D:
         """Return dashpot over mass in 1/s of a bumper at these depths in m, without added laws."""
-        coefficients = self._prepared.coefficients
+        coefficients = self._constants.coefficients
         dashpot = coefficients.c_l if side else coefficients.c_r
         rate: Float1D = (dashpot + coefficients.ch * np.abs(depth)) / coefficients.m
         return rate
@@ -314,7 +314,7 @@ class EventDrivenMap(PeriodMap):
         return states[0, self.indices]
 
     def rest(self) -> Float1D:
-        coefficients, laws, _, indices = self._prepared
+        coefficients, laws, _, indices = self._constants
         p = self.model.parameters
         solver = EventDrivenSolver(self.model, p, coefficients, _NO_PROPAGATORS, laws)
         return solver.rest_state()[indices]

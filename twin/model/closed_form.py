@@ -44,7 +44,7 @@ from twin.model.contact_regime import (
     SUBSTEPS,
     U_L,
     U_R,
-    Segment,
+    ModeSegment,
     U,
     V,
     advance_through_events,
@@ -172,7 +172,7 @@ def discretized_params(parameters: Parameters, rate_hz: float) -> Float1D:
     return params
 
 
-class EventLog(NamedTuple):
+class ContactLog(NamedTuple):
     """Contact events (m, 5), `EVENT_COLUMNS`, and the step in progress: its start in s, and A."""
 
     events: Float2D
@@ -198,7 +198,7 @@ def add_impulses(
 
 @jit_helper()
 def log_segment(
-    log: EventLog, count: int, state: Float1D, params: Float1D, segment: Segment
+    log: ContactLog, count: int, state: Float1D, params: Float1D, segment: ModeSegment
 ) -> int:
     """Add impulses over a segment and write its event, if it fits; return the number of events."""
     events, start, base, slope = log
@@ -256,7 +256,7 @@ def advance_samples(
             u, v, ur, ul = step.u, step.v, flush_denormal(step.u_r), flush_denormal(step.u_l)
         else:
             state[U], state[V], state[U_R], state[U_L], state[BASE] = u, v, ur, ul, base
-            log = EventLog(events, i * h, base, slope)
+            log = ContactLog(events, i * h, base, slope)
             count = advance_through_events(
                 state, params, h, base, slope, (0.0, 0.0, 0.0), log_segment, log, count
             )

@@ -36,7 +36,7 @@ MODE_SIZE = 9
 PARAMS_SIZE = MODES + 4 * MODE_SIZE
 
 
-class Segment(NamedTuple):
+class ModeSegment(NamedTuple):
     """Motion in one mode up to an event on `side` (0 right, 1 left, -1 none), dt s long.
 
     `begin` in s since the start of the step; `faces`: u_r and u_l in m there; x0, x1: the motion at
@@ -53,7 +53,7 @@ class Segment(NamedTuple):
     x1: Kinematics
 
 
-class Step(NamedTuple):
+class ModeStep(NamedTuple):
     """A step in one mode, if no guard has turned negative within it (`is_clear`).
 
     u, v, u_r, u_l and total acceleration `a` at its end; u'' at both ends; guards of right and
@@ -73,7 +73,7 @@ class Step(NamedTuple):
 
 
 # (what is recorded, its count, state at the end, parameters, segment) -> count
-Observer = Callable[[Any, int, Float1D, Float1D, Segment], int]
+Observer = Callable[[Any, int, Float1D, Float1D, ModeSegment], int]
 
 PENETRATION_TOL_M = 1e-14  # m: smaller penetrations are rounding errors
 DENORMAL_LIMIT = 1e-30  # m: smaller bumper deformations are set to zero
@@ -228,7 +228,7 @@ def take_step(
     departure: Departure,
     particular: tuple[float, float],
     base: tuple[float, float],
-) -> Step:
+) -> ModeStep:
     """Return the step over h s of the discretized parameters from x = (u, v, u_r, u_l).
 
     departure: u and u' of the homogeneous part at the start; particular: those of the particular
@@ -245,7 +245,7 @@ def take_step(
     right = step_guard(params, mode, 0, (u, v, d0), (u1, v1, d1), ur)
     left = step_guard(params, mode, 1, (u, v, d0), (u1, v1, d1), ul)
     is_clear = stays_positive(h, right) and stays_positive(h, left)
-    return Step(u1, v1, right[0], left[0], a1, d0, d1, right, left, is_clear)
+    return ModeStep(u1, v1, right[0], left[0], a1, d0, d1, right, left, is_clear)
 
 
 @jit_helper(inlined=True)
@@ -335,7 +335,9 @@ def advance_through_events(
             (peak, w, phase + w * t),
             attempt + 1 < MAX_EVENTS_PER_STEP,
         )
-        count = observe(record, count, state, params, Segment(mode, t, dt, side, faces, m, x0, x1))
+        count = observe(
+            record, count, state, params, ModeSegment(mode, t, dt, side, faces, m, x0, x1)
+        )
         t += dt
         if side < 0:
             break

@@ -31,12 +31,12 @@ from twin.model.contact_regime import (
     U_L,
     U_R,
     Kinematics,
+    ModeSegment,
     ModeSolution,
+    ModeStep,
     Observer,
     Quantity,
-    Segment,
     Sinusoid,
-    Step,
     U,
     V,
     advance_through_events,
@@ -79,7 +79,7 @@ DRIVE_TYPE = types.NamedTuple(
 )
 # (what is recorded, parameters, length of the step in s, A, u and u' at its start, mode, step) ->
 # whether that is done; otherwise the step is taken again with an observer
-Recorder = Callable[[Any, Float1D, float, Sinusoid, tuple[float, float], int, Step], bool]
+Recorder = Callable[[Any, Float1D, float, Sinusoid, tuple[float, float], int, ModeStep], bool]
 
 
 @jit_helper()
@@ -152,7 +152,7 @@ def accept_step(
     wave: Sinusoid,
     start: tuple[float, float],
     mode: int,
-    step: Step,
+    step: ModeStep,
 ) -> bool:
     """Record nothing of a step without events; see `Recorder`."""
     return True
@@ -160,7 +160,7 @@ def accept_step(
 
 @jit_helper()
 def ignore_segment(
-    record: None, count: int, state: Float1D, params: Float1D, segment: Segment
+    record: None, count: int, state: Float1D, params: Float1D, segment: ModeSegment
 ) -> int:
     """Record nothing of a segment; see `Observer`."""
     return count
@@ -221,7 +221,7 @@ def widen_extremes(
 
 @jit_helper()
 def widen_by_segment(
-    extremes: Float1D, count: int, state: Float1D, params: Float1D, segment: Segment
+    extremes: Float1D, count: int, state: Float1D, params: Float1D, segment: ModeSegment
 ) -> int:
     """Widen the extremes of a cycle by a segment of its motion; see `Observer`."""
     mode, _, dt, side, _, m, x0, x1 = segment
@@ -239,7 +239,7 @@ def widen_by_step(
     wave: Sinusoid,
     start: tuple[float, float],
     mode: int,
-    step: Step,
+    step: ModeStep,
 ) -> bool:
     """Widen the extremes of a cycle by a step without events; see `Recorder`.
 
