@@ -16,6 +16,7 @@ from twin.laws.library import EFFECTS
 from twin.model.force_laws import Coefficients
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import EffectInstance, Model
+from twin.model.prepare import prepare_solver
 from twin.model.solver import StateEstimate
 
 BASES = [snm(), snm(-0.001), snm(math.inf), snm(bumper_stiffness_r=7e5, gap_l=0.0031)]
@@ -262,7 +263,7 @@ class TestMotion:
         self.cut(having(effect), size)
 
     def cut(self, model, size):
-        solver, base = model.prepare(RATE_HZ), noisy(0.7)
+        solver, base = prepare_solver(model, RATE_HZ), noisy(0.7)
         whole, out = drive(model, base)
         state, cut = solver.rest_state(), np.empty_like(out)
         for first in range(0, base.size, size):
