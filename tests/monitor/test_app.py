@@ -94,7 +94,7 @@ def until(watch: MonitorClient, hub: BusLink, what: Callable[[LiveRunState], obj
     raise AssertionError("it never came")
 
 
-def test_who_joins_late_gets_what_was_and_then_what_comes() -> None:
+def test_late_monitor_gets_the_history_then_new_items() -> None:
     place = endpoint()
     with hub_at(place) as hub:
         publish(hub, [*records(), *stream(6000, 8000)])
@@ -111,7 +111,7 @@ def test_who_joins_late_gets_what_was_and_then_what_comes() -> None:
             assert watch.ignored == 0
 
 
-def test_bytes_that_are_no_record_are_left_out() -> None:
+def test_undecodable_bytes_are_ignored() -> None:
     place = endpoint()
     with hub_at(place) as hub, watching_at(place) as watch:
         hub.publish("/twin/point", b"\xff\xff garbage")
@@ -120,7 +120,7 @@ def test_bytes_that_are_no_record_are_left_out() -> None:
         assert watch.ignored == 1
 
 
-def test_a_rig_that_goes_is_silent_and_a_new_run_at_its_place_is_shown() -> None:
+def test_lost_rig_is_silent_and_a_new_run_is_shown() -> None:
     place = endpoint()
     with watching_after(place) as watch:
         watch.listen(0.1)
@@ -189,7 +189,7 @@ class Still:
         ("syhyq", False, []),
     ],
 )
-def test_an_order_goes_out_only_after_a_yes_of_who_may(
+def test_command_is_sent_only_after_confirmation_with_the_role(
     keys: str, commands: bool, orders: list[str]
 ) -> None:
     given: list[str] = []
@@ -223,7 +223,7 @@ def test_only_lines_that_changed_are_written() -> None:
     assert out.getvalue().strip("\0") == ""
 
 
-def test_once_and_picture(
+def test_snapshot_is_printed_or_written_as_svg(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(app, "SNAPSHOT_S", 0.2)
@@ -241,7 +241,7 @@ def test_once_and_picture(
             run_monitor(place, "simulated", False, False, tmp_path / "no" / "now.svg", None)
 
 
-def test_nobody_there_and_nothing_said_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_monitor_without_rig_or_run_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "ANSWER_TIMEOUT_S", 0.3)
     monkeypatch.setattr(app, "START_TIMEOUT_S", 0.3)
     place = endpoint()
@@ -253,7 +253,7 @@ def test_nobody_there_and_nothing_said_are_told(monkeypatch: pytest.MonkeyPatch)
         run_monitor(place, "simulated", False, True, None, None)
 
 
-def test_without_a_terminal_it_is_a_line_a_step_until_the_end() -> None:
+def test_output_without_terminal_has_a_line_per_step() -> None:
     place = endpoint()
     with hub_at(place) as hub:
         publish(hub, [*records(), RunStop(8000, "complete", "all driven")])
@@ -271,7 +271,7 @@ def test_without_a_terminal_it_is_a_line_a_step_until_the_end() -> None:
     assert "complete: all driven" in output
 
 
-def test_on_a_terminal_it_draws_and_gives_it_back(tmp_path: Path) -> None:
+def test_terminal_is_drawn_and_restored(tmp_path: Path) -> None:
     place = endpoint()
     here, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))

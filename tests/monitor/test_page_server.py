@@ -157,7 +157,7 @@ def is_over(answer: http.client.HTTPResponse) -> bool:
     return True
 
 
-def test_the_files_need_nothing_from_elsewhere(page: Served) -> None:
+def test_page_files_need_no_other_origin(page: Served) -> None:
     for path, (name, content_type) in PAGE_FILES.items():
         answer = page.get(path)
         assert (answer.status, answer.getheader("Content-Type")) == (200, content_type)
@@ -183,7 +183,7 @@ def test_nothing_else_is_served(page: Served, path: str) -> None:
     "host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", ""]
 )
 @pytest.mark.parametrize("path", ["/", "/events"])
-def test_a_name_that_is_not_its_own_is_refused(page: Served, host: str, path: str) -> None:
+def test_foreign_host_header_is_refused(page: Served, host: str, path: str) -> None:
     assert page.get(path, Host=host.format(port=page.port)).status == 421
     assert page.post(b"{}", Host=host.format(port=page.port))[0] == 421
 
@@ -197,7 +197,7 @@ def test_a_name_that_is_not_its_own_is_refused(page: Served, host: str, path: st
         ("127.0.0.1", 80, "127.0.0.1"),  # the port of the scheme is not sent
     ],
 )
-def test_the_names_that_a_browser_sends_are_its_own(host: str, port: int, header: str) -> None:
+def test_host_headers_of_browsers_are_accepted(host: str, port: int, header: str) -> None:
     assert header in grant_page_access(host, port, None).hosts
 
 
@@ -278,7 +278,7 @@ def test_a_request_that_trickles_in_is_dropped(
         pytest.fail("the connection is still open")
 
 
-def test_headers_are_limited_in_all(page: Served) -> None:
+def test_size_of_all_headers_is_limited(page: Served) -> None:
     """Otherwise 99 headers of 64 kB from each client fill the memory of the rig's computer."""
     with socket.create_connection(("127.0.0.1", page.port), PATIENCE_S) as client:
         with suppress(ConnectionError):
@@ -426,7 +426,7 @@ def test_no_page_beyond_this_computer_without_the_keys_of_the_rig(lab: Path, nam
 
 
 @pytest.mark.parametrize("address", ["7480", "here", ":7480", "127.0.0.1:", "127.0.0.1:99999"])
-def test_an_address_that_is_none_is_refused(address: str) -> None:
+def test_malformed_page_address_is_refused(address: str) -> None:
     with raises_input_error(key="--web-listen", value=address):
         choose_page_address(address)
 
@@ -453,7 +453,7 @@ def test_the_gateway_judges_commands_of_the_page_by_the_person(lab: Path) -> Non
     assert submit_page_command(PageCommand("hold", RUN, "anna"), request, keys).status == 504
 
 
-def test_no_command_waits_for_those_of_others(
+def test_commands_of_others_do_not_delay_a_command(
     lab: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Otherwise an observer delays a stop with orders that are refused one after another."""
@@ -479,7 +479,7 @@ def test_no_command_waits_for_those_of_others(
             post.join()
 
 
-def test_one_command_of_a_person_at_a_time(page: Served) -> None:
+def test_commands_of_a_person_are_serialized(page: Served) -> None:
     """One person presses several times: the handler never runs twice at the same time."""
     active, most = 0, 0
 

@@ -99,7 +99,7 @@ def test_the_page_of_a_run_is_a_process_that_ends_with_it(
     assert is_free(port)
 
 
-def test_the_server_of_somebody_else_is_not_announced_as_the_page(
+def test_foreign_server_is_not_announced_as_the_page(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other, raises_input_error(key="--web"):

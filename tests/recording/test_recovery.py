@@ -1,5 +1,6 @@
 """Damaged logs: one accident costs what it hit and no more, and no file costs more than it may."""
 
+import gc
 import random
 import struct
 import tracemalloc
@@ -29,6 +30,7 @@ from twin.recording.recovery import (
     MESSAGE_INDEX,
     RECORD_HEADER,
     find_record_candidates,
+    pause_collection,
     recover_log,
     work_limit,
 )
@@ -415,3 +417,18 @@ def test_wrong_checksum_of_the_data_is_damage(content: bytes, tmp_path: Path) ->
     ) == payloads(run())
     (damage,) = recover_log(tmp_path / "a.mcap").damage
     assert "the data differ" in damage.reason
+
+
+def test_collection_resumes_after_the_outermost_pause() -> None:
+    assert gc.isenabled()
+    with pause_collection():
+        with pause_collection():
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+    assert gc.isenabled()
+
+
+def test_an_error_ends_the_pause_of_collection() -> None:
+    with pytest.raises(ValueError, match="inside"), pause_collection():
+        raise ValueError("inside")
+    assert gc.isenabled()

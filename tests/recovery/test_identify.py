@@ -51,7 +51,7 @@ def test_a_truth_far_from_the_start_is_found_within_its_intervals() -> None:
     assert np.sqrt(joint.cost) == pytest.approx(1.0, abs=0.03)
 
 
-def test_flight_contacts_and_onsets_say_the_same_each_from_samples_of_its_own() -> None:
+def test_flight_contacts_and_onsets_agree() -> None:
     parts = {part.source: part.values for part in identify_wide_gaps().subsets}
     assert set(parts["free flight"]) == {STIFFNESS, DAMPING}
     assert set(parts["contact right"]) == {BUMPER_STIFFNESS, BUMPER_DAMPING, GapKey(0)}
@@ -66,7 +66,7 @@ def test_flight_contacts_and_onsets_say_the_same_each_from_samples_of_its_own() 
     assert identify_wide_gaps().warnings == ()
 
 
-def test_windows_restarted_from_the_measured_state_go_better_than_with_the_start() -> None:
+def test_identified_windows_err_less_than_the_start_model() -> None:
     (pair,) = identify_wide_gaps().window_errors
     assert pair is not None
     before, after = pair
@@ -74,12 +74,12 @@ def test_windows_restarted_from_the_measured_state_go_better_than_with_the_start
     assert before > 5 * after
 
 
-def test_a_wrong_specimen_is_said() -> None:
+def test_wrong_specimen_mass_is_reported() -> None:
     notes = " ".join(identify_wide_gaps().notes)
     assert "bumper_stiffness: " in notes
 
 
-def test_a_log_that_never_touches_gives_the_damper_and_says_what_it_keeps() -> None:
+def test_log_without_contact_identifies_the_damper_only() -> None:
     blocks = make_noisy_blocks(0.01, 4, FLIGHT)
     result = identify_parameters([prepare_log(blocks, FLIGHT)], [blocks], FAR)
     for key in (STIFFNESS, DAMPING):
@@ -179,7 +179,7 @@ def joint(noise: float, seed: int) -> tuple[FitResult, FitResult]:
     return raw, correct_bias(prepared.problem.log_residuals, raw)
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
+def test_intervals_cover_the_truth_at_their_level() -> None:
     """A handful: 95 % of 60 are 57, fewer than 52 come once in a hundred times."""
     hits = [
         abs(fit.values[key] - value) < SIGMA_OF_95_PERCENT * fit.std_errors[key]
@@ -201,6 +201,6 @@ def test_noise_of_the_motion_is_no_softening() -> None:
     assert abs(mended - truth) < 0.5 * abs(raw - truth)
 
 
-def test_a_guess_keeps_what_nobody_fitted() -> None:
+def test_parameters_without_data_keep_their_start() -> None:
     assert isinstance(identify_wide_gaps().start, ParameterSet)
     assert identify_wide_gaps().start.values[STIFFNESS] == 60e3

@@ -44,7 +44,7 @@ def identification(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]
     return out, outcome.output
 
 
-def test_the_model_that_is_left_is_one_that_a_run_takes(identification: tuple[Path, str]) -> None:
+def test_identified_model_is_readable_by_run(identification: tuple[Path, str]) -> None:
     model, _ = read_model(str(identification[0]))
     assert isinstance(model, ModelConfig)
     assert model.base.stiffness_n_m == pytest.approx(TRUTH["stiffness"], rel=0.003)
@@ -53,7 +53,7 @@ def test_the_model_that_is_left_is_one_that_a_run_takes(identification: tuple[Pa
     assert model.fitted_on == "short"
 
 
-def test_the_evidence_lies_beside_it(identification: tuple[Path, str]) -> None:
+def test_identify_writes_evidence_and_figures(identification: tuple[Path, str]) -> None:
     folder = identification[0].with_suffix("")
     evidence = json.loads((folder / "identify.json").read_text(encoding="utf-8"))
     stiffness = evidence["parameters"]["stiffness"]
@@ -78,7 +78,7 @@ def test_the_page_shows_each_value_with_its_interval(identification: tuple[Path,
         assert estimate["cycles"] > 3
 
 
-def test_the_terminal_says_it_all(identification: tuple[Path, str]) -> None:
+def test_identify_prints_its_result(identification: tuple[Path, str]) -> None:
     for text in ("K_j", "gap of short", "free flight", "contact left", "onsets", "windows of 1 s"):
         assert text in identification[1]
 
@@ -91,7 +91,7 @@ def test_the_terminal_says_it_all(identification: tuple[Path, str]) -> None:
         (["--model", "nothing"], "nothing"),
     ],
 )
-def test_what_cannot_be_is_refused_before_the_log_is_read(
+def test_invalid_options_of_identify_are_refused_before_reading(
     more: list[str], word: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

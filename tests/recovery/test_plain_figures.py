@@ -124,7 +124,7 @@ def identify(hidden: Hidden, noise: float = NOISE) -> tuple[IdentificationResult
     return result, identification_to_json(result, []), block
 
 
-def test_a_model_that_misses_by_many_times_the_noise_says_so() -> None:
+def test_model_error_many_times_the_noise_is_reported() -> None:
     """Where model error rules every log gets the same weight; the figure is over the noise."""
     hidden = Hidden("bouc_wen", 900.0, 3e-3)
     result, report, block = identify(hidden, noise=2e-4)
@@ -137,7 +137,7 @@ def test_a_model_that_misses_by_many_times_the_noise_says_so() -> None:
     assert 0.4 * plain < report["rms_over_noise"] < plain  # other rows are noise
 
 
-def test_the_motion_errors_of_windows_stand_beside_their_noise() -> None:
+def test_motion_errors_of_windows_have_their_noise_floor() -> None:
     result, report, block = identify(Hidden(gap=GAP))
     (window,) = report["windows"]
     u = block.channel("rel_disp_m")

@@ -137,7 +137,7 @@ def test_a_changed_hash_or_block_is_found(
     assert replay(tmp_path / "block.mcap", tmp_path / "b") == (False, 0, 1, block.index)
 
 
-def test_verify_says_what_is_recorded(sparse_log: Path, log_file: Path) -> None:
+def test_verify_counts_recorded_predictions(sparse_log: Path, log_file: Path) -> None:
     sparse, full = (examine_logs([path]).report for path in (sparse_log, log_file))
     assert (sparse.predictions.every, full.predictions.every) == (10, 1)
     assert sparse.predictions.hashed == full.predictions.hashed

@@ -29,7 +29,7 @@ def bundle() -> RunConfig:
     return read_run_config(QUICK)
 
 
-def test_the_estimate_is_what_is_written_unpacked(bundle: RunConfig) -> None:
+def test_estimated_size_is_that_of_unpacked_data(bundle: RunConfig) -> None:
     # 9 measured channels, a tenth of the twin's 16, comparisons as 2, 8 bytes each, at 2 kHz
     assert bytes_per_s(bundle) == pytest.approx(2000 * 8 * (9 + 1.6 + 2))
     seconds = bundle.drive.planned_end / 2000
@@ -71,7 +71,7 @@ def test_a_full_disk_refuses_run_and_campaign_and_nothing_is_made(
         run_campaign(replace(asked, resume=True))
 
 
-def test_a_disk_that_fills_up_is_told_twice_in_time() -> None:
+def test_filling_disk_is_announced_twice_in_time() -> None:
     room, rate = DiskForecast(1000.0), 250_000
     assert room.check(0, 0.0, 1) is None  # nothing is known yet
     assert room.check(10 * rate, 10.0, 991 * rate) is None
@@ -98,7 +98,7 @@ def test_a_reserve_holds_room_and_gives_it_back(tmp_path: Path) -> None:
     ).release()  # what cannot be had is done without
 
 
-def test_a_successor_foresees_as_its_predecessor_would() -> None:
+def test_restarted_recorder_forecasts_as_its_predecessor() -> None:
     """It has written little itself, in a run that is old."""
     whole, successor, rate, free = DiskForecast(7200.0), DiskForecast(7200.0), 250_000, 200_000_000
     whole.check(0, 0.0, 10**12)

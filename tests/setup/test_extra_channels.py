@@ -82,7 +82,7 @@ def summary(run: Path) -> dict[str, Any]:
     return dict(json.loads((run / "summary.json").read_text()))
 
 
-def test_they_are_recorded_and_the_recording_is_whole(run: Path) -> None:
+def test_declared_channels_are_recorded(run: Path) -> None:
     assert json.loads(shaketwin("verify", run, "--json"))["sound"] is True
     log = open_log(run)
     assert log.channels[-4:] == (*EXTRA, "rel_disp_m")
@@ -115,7 +115,7 @@ def test_a_replay_is_identical_to_the_bit(run: Path, lab: Path) -> None:
     assert replayed["comparison"] == recorded["comparison"]
 
 
-def test_a_replay_that_differs_in_a_declared_channel_says_so(run: Path, lab: Path) -> None:
+def test_replay_reports_differences_of_a_declared_channel(run: Path, lab: Path) -> None:
     model = (Path(__file__).parents[2] / "profiles/models/snm.toml").read_text()
     (lab / "stiff.toml").write_text(model.replace("36000.0", "40000.0"))
     replay = ("replay", run, "--model", lab / "stiff.toml", "--speed", "max")
@@ -125,7 +125,7 @@ def test_a_replay_that_differs_in_a_declared_channel_says_so(run: Path, lab: Pat
 
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_an_export_has_their_columns_and_comes_back(run: Path, lab: Path, kind: str) -> None:
+def test_export_of_declared_channels_is_imported_again(run: Path, lab: Path, kind: str) -> None:
     shaketwin("export", run, f"--{kind}", "-o", lab / "out")
     table = read_table(lab / f"out.{kind}")
     log = open_log(run)
@@ -147,7 +147,7 @@ def test_an_export_has_their_columns_and_comes_back(run: Path, lab: Path, kind: 
         np.testing.assert_array_equal(open_log(back)[name], log[name])
 
 
-def test_columns_are_mapped_to_them_in_their_units(lab: Path) -> None:
+def test_import_maps_columns_to_declared_channels_in_their_units(lab: Path) -> None:
     laboratory(lab)
     t = np.arange(2000) / 1000.0
     rows = np.stack([t, np.sin(t), 20.0 + t, 9.0 * np.cos(t)], axis=1)
@@ -168,7 +168,7 @@ table_disp_m = {{ column = "laser", unit = "mm" }}
     np.testing.assert_allclose(log[SECOND_ACC], 9.80665 * 9.0 * np.cos(t))
 
 
-def test_foxglove_and_rerun_show_them(run: Path, lab: Path) -> None:
+def test_foxglove_and_rerun_show_declared_channels(run: Path, lab: Path) -> None:
     shaketwin("export", run, "--foxglove", "--rrd", "-o", lab / "shown")
     assert f"{TEMPERATURE}".encode() in (lab / "shown.foxglove.mcap").read_bytes()
     log = open_log(run)
@@ -177,7 +177,7 @@ def test_foxglove_and_rerun_show_them(run: Path, lab: Path) -> None:
         np.testing.assert_array_equal(values[:, 0], log[name][::2])  # lines of 500 Hz
 
 
-def test_the_report_lists_their_sensors(run: Path) -> None:
+def test_report_lists_sensors_of_declared_channels(run: Path) -> None:
     rows = {row.channel: row for row in build_sensor_rows(read_recording(run / "run.mcap").start)}
     assert rows[SECOND_ACC].serial == "A-17"
     assert rows[SECOND_ACC].tare == pytest.approx(0.002, abs=1e-4)
@@ -186,14 +186,14 @@ def test_the_report_lists_their_sensors(run: Path) -> None:
     assert all(f"<code>{name}</code>" in page for name in EXTRA)
 
 
-def test_the_check_predicts_their_peaks(lab: Path) -> None:
+def test_check_predicts_peaks_of_declared_channels(lab: Path) -> None:
     predicted = predict_response(read_run_config(laboratory(lab))).peaks
     peaks = {peak.sensor.channel: peak.peak for peak in predicted}
     assert peaks[SECOND_ACC] == peaks["mass_acc_m_s2"]
     assert {TEMPERATURE, UPWARD_ACC}.isdisjoint(peaks)
 
 
-def test_the_monitor_lists_them(run: Path) -> None:
+def test_monitor_lists_declared_channels(run: Path) -> None:
     recording = read_recording(run / "run.mcap")
     state = LiveRunState()
     comparisons = [item for item in recording.items if isinstance(item, Comparison)]
@@ -214,7 +214,7 @@ def test_the_monitor_lists_them(run: Path) -> None:
     ("kind", "channel", "gap"),
     [("rail", SECOND_ACC, "clipped"), ("nan", TEMPERATURE, "lost")],
 )
-def test_a_fault_of_one_is_in_the_recording_and_its_summary(
+def test_fault_of_a_declared_channel_is_recorded(
     tmp_path: Path, kind: str, channel: str, gap: str
 ) -> None:
     fault = f'\n[[simulated.faults]]\nkind = "{kind}"\nat_s = 12.0\nchannel = "{channel}"\n'

@@ -114,7 +114,7 @@ def test_the_table_follows_the_record_after_a_loop_check(run: Run) -> None:
     assert np.std((table - command)[:-lag]) < 0.05 * np.std(command)
 
 
-def test_nothing_of_a_stepped_sine_is_recorded(run: Run) -> None:
+def test_record_has_no_results_of_a_stepped_sine(run: Run) -> None:
     """No amplitude is tuned: the drive is open loop."""
     _, recording, summary = run
     assert recording.start.steps == ()

@@ -121,7 +121,7 @@ def test_every_sample_has_its_prediction_and_its_comparison(run: tuple) -> None:
     assert {comparison.count for comparison in comparisons} == {20}
 
 
-def test_the_log_holds_all_that_the_run_was(run: tuple) -> None:
+def test_log_holds_inputs_and_records_of_the_run(run: tuple) -> None:
     bundle, recording, _ = run
     (start,) = recording.records(RunStart)
     texts = (start.profile_toml, start.rig_toml, start.model_toml)

@@ -69,7 +69,7 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
     assert len(bundle.steps) == 2
 
 
-def test_a_replay_says_of_the_visits_what_was_said_to_the_bit(run: tuple, tmp_path: Path) -> None:
+def test_replay_of_visits_is_identical(run: tuple, tmp_path: Path) -> None:
     bundle, recording, summary = run
     made = tmp_path / "run.mcap"
     identity = replay_recording(

@@ -43,7 +43,7 @@ def test_a_run_under_too_low_a_limit_is_refused_with_the_limit(
     assert not (tmp_path / "new").exists()
 
 
-def test_a_stop_order_is_sent_with_any_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stop_command_is_sent_with_any_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(entry, "send_order", lambda words: True)
     monkeypatch.setattr(entry, "require_memory", lambda _: pytest.fail("the order was delayed"))
     entry.run_words(["control", "stop"])

@@ -81,7 +81,7 @@ def test_a_killed_parent_leaves_no_processes() -> None:
     assert not worker.is_dir()
 
 
-def test_a_stop_hands_out_what_is_under_way() -> None:
+def test_stop_returns_running_tasks() -> None:
     numbers: list[int] = []
     for result in run_tasks(
         task_functions.return_process, range(100), Workers(1), lambda: bool(numbers)
@@ -108,7 +108,7 @@ def test_a_stop_ends_threads_after_what_is_under_way() -> None:
     assert 1 <= len(numbers) <= 3
 
 
-def test_what_a_task_raises_in_a_thread_is_raised_here() -> None:
+def test_exception_of_a_task_in_a_thread_is_raised() -> None:
     with pytest.raises(ValueError, match="three"):
         list(run_tasks(task_functions.raise_at_three, range(9), THREADS))
 

@@ -69,7 +69,7 @@ def test_a_folder_that_was_just_made_stays(prefix: str, tmp_path: Path) -> None:
     assert not folder.exists()
 
 
-def test_what_is_not_of_this_program_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_of_other_programs_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     link, target = tmp_path / f"{SOCKET_PREFIX}link", tmp_path / "target"
     target.mkdir()
     (target / "file").touch()

@@ -49,7 +49,7 @@ def test_a_line_each_where_no_table_fits() -> None:
                for line in lines)  # fmt: skip
 
 
-def test_what_is_left_out_is_said_and_nothing_is_left_out_in_a_file() -> None:
+def test_omitted_columns_are_announced_on_terminals_only() -> None:
     assert any("--json" in line for line in print_lines(60))
     wide = print_lines(terminal.FILE_COLUMNS)
     assert not any("--json" in line for line in wide)
@@ -108,7 +108,7 @@ input()
     assert make_output_folder(out, "") == out, "the other has ended and left nothing"
 
 
-def test_only_a_long_wait_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+def test_only_a_long_wait_is_announced(capsys: pytest.CaptureFixture[str]) -> None:
     before = signal.getsignal(signal.SIGALRM)
     with terminal.announce_if_slow("compiling", 0.05):
         pass
@@ -120,7 +120,7 @@ def test_only_a_long_wait_is_told(capsys: pytest.CaptureFixture[str]) -> None:
     assert signal.getsignal(signal.SIGALRM) is before
 
 
-def test_every_kernel_of_a_command_is_had_before_it_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compile_kernels_compiles_all_a_command_needs(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the cache holds: a part of it is not the whole."""
     warmed: list[str] = []
     monkeypatch.setattr(warm_up, "compile_twin_kernels", lambda: warmed.append("twin"))
@@ -132,7 +132,7 @@ def test_every_kernel_of_a_command_is_had_before_it_begins(monkeypatch: pytest.M
     assert warmed == ["twin", "rig", "twin"]
 
 
-def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
+def test_texts_of_a_remote_twin_are_printable() -> None:
     quantities = NormalizedResponse(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, (), (), 0.0, 0.0)
     evil = "\x1b[2J\x1b]0;owned\x07\nstate: at rest\u202e"
     out = io.StringIO()
@@ -145,7 +145,7 @@ def test_what_a_twin_elsewhere_writes_gives_no_orders_to_the_terminal() -> None:
     assert [line[:12] for line in lines[2:]] == [f"{'':>7}  fau", f"{'':>7}  dri"]
 
 
-def test_of_a_series_of_gaps_the_first_is_shown_and_that_more_follow() -> None:
+def test_first_gap_of_a_series_is_shown_with_a_note() -> None:
     """A sensor off its range brings one a block; another channel, or the next series, is new."""
     out = io.StringIO()
     show = RunProgress(Console(file=out, width=200), 3, 100)
@@ -174,7 +174,7 @@ def test_a_qr_code_is_drawn_module_by_module() -> None:
 
 
 @pytest.mark.parametrize("is_terminal", [True, False])
-def test_a_silent_phase_shows_what_it_is_at_on_a_terminal_only(
+def test_status_of_a_silent_phase_is_shown_on_terminals_only(
     is_terminal: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = io.StringIO()

@@ -68,7 +68,7 @@ def hash_structure(packages: tuple[Path, ...]) -> str:
     return hashlib.sha256("\n".join(functions).encode()).hexdigest()[:12]
 
 
-def test_the_revision_belongs_to_the_code() -> None:
+def test_numerics_revision_matches_the_code() -> None:
     root = Path(twin.__file__).parent
     assert (
         hash_structure((root / "laws", root / "model", root / "compare"))

@@ -44,7 +44,7 @@ def test_scene_keeps_contact_true_in_the_picture() -> None:
     assert room_left == pytest.approx([0, 20 * 1e-3, 20 * 6e-3])
 
 
-def test_axes_and_reach() -> None:
+def test_axes_and_axis_range() -> None:
     axes = PlotAxes((-2.0, 2.0), (0.0, 0.4), "x", "y", 2.2)
     assert axes.ticks(0.0, 0.4) == pytest.approx([0, 0.1, 0.2, 0.3, 0.4])
     (places, texts), (sx, sy), (ox, oy) = axes.labels(), axes.scale, axes.origin

@@ -92,7 +92,7 @@ def until(hub: BusLink, live: LiveView, done: Any) -> None:
     raise AssertionError("it never came")
 
 
-def test_who_comes_late_has_the_start_the_events_and_the_prc(ends: tuple[BusLink, BusLink]) -> None:
+def test_late_live_view_has_start_events_and_prc(ends: tuple[BusLink, BusLink]) -> None:
     hub, spoke = ends
     points = [PrcPoint(20 * k, k, "forward", 1.0 + k, None, None, 1.0, 1.0, 0.0) for k in range(90)]
     put(hub, START, Event(0, "state", "checking"), *points)
@@ -111,7 +111,7 @@ def test_who_comes_late_has_the_start_the_events_and_the_prc(ends: tuple[BusLink
     assert live.end_reason.endswith("complete, played")
 
 
-def test_the_last_blocks_are_waited_for(
+def test_live_view_waits_for_the_last_blocks(
     ends: tuple[BusLink, BusLink], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Slow:
@@ -131,7 +131,7 @@ def test_the_last_blocks_are_waited_for(
     assert [block.index for block in shown_view(live).of(Block)] == [20]
 
 
-def test_garbage_and_another_run_are_passed_over(ends: tuple[BusLink, BusLink]) -> None:
+def test_live_view_ignores_garbage_and_other_runs(ends: tuple[BusLink, BusLink]) -> None:
     hub, spoke = ends
     live = LiveView(spoke, "127.0.0.1:1")
     until(hub, live, lambda: hub.subscriber_progress.positions)
@@ -148,7 +148,7 @@ def test_garbage_and_another_run_are_passed_over(ends: tuple[BusLink, BusLink]) 
     assert live.ignored == 5
 
 
-def test_it_ends_where_the_rig_is_gone(ends: tuple[BusLink, BusLink]) -> None:
+def test_live_view_ends_when_the_rig_is_gone(ends: tuple[BusLink, BusLink]) -> None:
     hub, spoke = ends
     live = LiveView(spoke, "127.0.0.1:1", max_silence_s=0.0)
     put(hub, START, block(0))
@@ -160,7 +160,7 @@ def test_it_ends_where_the_rig_is_gone(ends: tuple[BusLink, BusLink]) -> None:
     assert "rig" in live.end_reason
 
 
-def test_the_command_says_where_it_serves_and_how_it_ended(
+def test_view_command_prints_address_and_end(
     ends: tuple[BusLink, BusLink],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -197,7 +197,7 @@ def test_the_command_says_where_it_serves_and_how_it_ended(
     assert "complete, played" in output
 
 
-def test_what_only_a_recording_can_give_is_refused(tmp_path: Path) -> None:
+def test_options_of_a_recording_are_refused_for_a_live_view(tmp_path: Path) -> None:
     with raises_input_error(where=f"--save {tmp_path / 'v.rrd'}", remedy="LOG"):
         view.show_view(None, tmp_path / "v.rrd", None, "tcp/127.0.0.1:1", "rig")
     with raises_input_error(where=tmp_path / "no" / "v.png"):

@@ -98,7 +98,7 @@ def test_disagreement_estimates_and_the_jump_ahead(whole: Path) -> None:
     assert "u left its band" in shown["/warning"]["TextDocument:text"][1][-1][0]
 
 
-def test_what_a_bus_says_twice_is_drawn_once(tmp_path: Path) -> None:
+def test_repeated_items_are_drawn_once(tmp_path: Path) -> None:
     items = recording([*blocks(), *records()]).items
     again = [item for item in items if isinstance(item, PrcPoint)]
     for name, fed in (("once", items), ("twice", [*items[:300], *items, *again])):
@@ -184,7 +184,7 @@ def test_a_short_dropout_interrupts_the_line(tmp_path: Path) -> None:
     assert np.rint(times[np.isnan(drawn[:, 0])] * RATE_HZ).tolist() == [504]
 
 
-def test_a_lost_block_lifts_the_pen(tmp_path: Path) -> None:
+def test_lost_block_interrupts_the_line(tmp_path: Path) -> None:
     write_rrd(recording(blocks(skip=[50])), tmp_path / "gap.rrd")
     times, values = scalars(tmp_path / "gap.rrd", "/u/measured")
     index = np.rint(times * RATE_HZ).astype(int)
@@ -213,7 +213,7 @@ def test_missing_and_unknown_channels(tmp_path: Path, gap_mm: str) -> None:
     assert np.isnan(twin[:, 1]).all()
 
 
-def test_nothing_is_overwritten_and_nothing_leaves_this_machine(tmp_path: Path) -> None:
+def test_view_overwrites_no_file_and_serves_on_loopback_only(tmp_path: Path) -> None:
     existing = tmp_path / "there.rrd"
     existing.write_text("mine")
     with raises_input_error(where=existing):

@@ -48,7 +48,7 @@ def test_file_and_server_at_once(tmp_path: Path) -> None:
     assert scalars(tmp_path / "v.rrd", "/u/measured")[0].size == 200 / 4  # lines of 500 Hz
 
 
-def test_without_a_display_it_says_what_to_do(
+def test_open_viewer_without_display_names_the_remedy(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sys.platform", "linux")
@@ -108,7 +108,7 @@ def test_the_picture(whole: Path, tmp_path: Path) -> None:
     assert np.unique(picture[: height // 3, : width // 4].reshape(-1, 3), axis=0).shape[0] > 50
 
 
-def test_without_a_graphics_library_it_says_what_to_install(
+def test_screenshot_without_graphics_library_names_the_remedy(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WGPU_BACKEND", "vulkan")
