@@ -324,6 +324,11 @@ class StepAdded:
     acceleration_m_s2: float
     reason: str
 
+    @property
+    def as_step(self) -> Step:
+        """The step as a planned one would be."""
+        return Step(self.step, self.direction, self.frequency_hz, self.acceleration_m_s2)
+
 
 @dataclass(frozen=True, slots=True)
 class OrbitPoint:

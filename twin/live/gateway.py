@@ -124,8 +124,8 @@ class RunStatus:
                 self.state = text
             case SampleGap():
                 self.gaps += 1
-            case StepAdded(step=step, direction=direction, frequency_hz=f, acceleration_m_s2=a):
-                self._decided_steps[step] = Step(step, direction, f, a)
+            case StepAdded():
+                self._decided_steps[item.step] = item.as_step
 
     def _decode(self, topic: str, payload: bytes) -> Item | None:
         """Return the decoded item, or None if it is invalid or of another run."""

@@ -222,11 +222,10 @@ def _add_record(run_state: LiveRunState, record: Record) -> None:
             _put_bounded(run_state.points, record.step, record, MAX_POINTS)
         case OrbitPoint():
             _put_bounded(run_state.orbits, record.step, record, MAX_POINTS)
-        case StepAdded(step=index, direction=direction, frequency_hz=f, acceleration_m_s2=a):
-            step = Step(index, direction, f, a)
-            _put_bounded(run_state.added_steps, index, step, MAX_POINTS)
+        case StepAdded():
+            _put_bounded(run_state.added_steps, record.step, record.as_step, MAX_POINTS)
             if run_state.expected_end is not None:
-                run_state.expected_end.add_step(step, record.index)
+                run_state.expected_end.add_step(record.as_step, record.index)
         case Timing():
             _put_bounded(run_state.timings, record.component, record, MAX_COMPONENTS)
         case Agreement() | JumpForecast() | CycleExtremes() | Estimate() | Level():

@@ -255,9 +255,7 @@ def collect_steps(start: RunStart, items: Iterable[Item]) -> dict[int, Step]:
     steps = {step.index: step for step in start.steps}
     for record in items:
         if isinstance(record, StepAdded):
-            steps[record.step] = Step(
-                record.step, record.direction, record.frequency_hz, record.acceleration_m_s2
-            )
+            steps[record.step] = record.as_step
     return steps
 
 
