@@ -38,6 +38,7 @@ from twin.transport.codec import (
     Item,
     encode_item,
     message_schema,
+    topic_for,
 )
 
 MEDIA_TYPES = {".toml": "toml", ".json": "json", ".pb": "protobuf"}
@@ -356,8 +357,6 @@ def open_foreign_log(file: BinaryIO) -> Iterator[Writer]:
 
 def write_items(path: Path, items: list[Item], start: RunStart) -> None:
     """Write a new log with these items, for tests and conversions."""
-    from twin.transport.codec import topic_for
-
     writer = LogWriter(path, start.rate_hz)
     writer.write_run_description(start)
     for item in items:

@@ -18,6 +18,7 @@ from twin.recording.run_paths import explain_unmerged_parts as scattered
 from twin.report.finalize import EXIT_GAPS
 from twin.results.recordings import list_parts, read_recorded_config
 from twin.results.sensor_table import SensorRow, build_sensor_rows
+from twin.results.summary import dump_strict_json
 from twin.system.terminal import console, print_line, print_table
 from twin.system.versions import (
     VersionPairs,
@@ -127,8 +128,6 @@ class Verification:
 
 def verify_logs(logs: list[Path], as_json: bool, repair: Path | None) -> int:
     """Verify a log or its parts, print the report, repair if asked; return the exit code."""
-    from twin.results.summary import dump_strict_json
-
     paths = [part for log in logs for part in list_parts(log)]
     verification = examine_logs(paths, [message for log in logs if (message := scattered(log))])
     if as_json:
