@@ -4,6 +4,7 @@ The sample index is the time base: sample i is taken i / rate_hz seconds after t
 No calculation reads a wall clock.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -138,6 +139,18 @@ def join_blocks(blocks: Sequence[Block]) -> Block:
     )
 
 
+def finite_mean(samples: Float1D) -> float:
+    """Return the mean of the samples that are not lost, (sample,); NaN if all are."""
+    finite = samples[np.isfinite(samples)]
+    return float(finite.mean()) if finite.size else math.nan
+
+
+def finite_std(samples: Float1D) -> float:
+    """Return the standard deviation of the samples that are not lost, (sample,); NaN if all are."""
+    finite = samples[np.isfinite(samples)]
+    return float(finite.std()) if finite.size else math.nan
+
+
 def join_contiguous(blocks: Iterable[Block]) -> tuple[Block, ...]:
     """Join the blocks of one stream, in order, where they are contiguous with equal channels."""
     runs: list[list[Block]] = []
@@ -148,19 +161,3 @@ def join_contiguous(blocks: Iterable[Block]) -> tuple[Block, ...]:
         else:
             runs.append([block])
     return tuple(join_blocks(run) for run in runs)
-
-
-def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
-    """Yield the same samples in blocks of length `samples` (the last one may be shorter)."""
-    pending: list[Block] = []
-    pending_samples = 0
-    for block in blocks:
-        pending.append(block)
-        pending_samples += len(block)
-        while pending_samples >= samples:
-            joined = join_blocks(pending)
-            yield joined.cut(joined.index, joined.index + samples)
-            pending_samples -= samples
-            pending = [joined.cut(joined.index + samples, joined.end)] if pending_samples else []
-    if pending_samples:
-        yield join_blocks(pending)

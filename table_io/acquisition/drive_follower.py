@@ -54,7 +54,7 @@ def refuse_motion(
     means = tare_m[: tare_m.size // size * size].reshape(-1, size).mean(axis=1)
     known = means[~np.isnan(means)]
     motion = float(np.ptp(known)) if known.size else 0.0
-    noise = NOISE_SIGMAS * sensor.noise_rms * abs(sensor.si_per_unit)
+    noise = NOISE_SIGMAS * sensor.noise_si
     rest_limit = noise + NOISE_LSB * 2 * sensor.range_si / 2**sensor.bits
     if motion <= rest_limit:
         return

@@ -388,6 +388,10 @@ class RigConfig(ConfigModel):
         """Names of the acquired channels, in the order of the sensors."""
         return tuple(sensor.channel for sensor in self.sensors)
 
+    def sensor(self, channel: str) -> SensorConfig:
+        """Return the sensor of a channel; ValueError if the rig has none."""
+        return self.sensors[self.channels.index(channel)]
+
     @property
     def channel_by_name(self) -> dict[str, Channel]:
         """Registry of this rig: the canonical channels and those that it declares."""

@@ -161,6 +161,16 @@ class SensorConfig(ConfigModel):
         return self.range * self.si_per_unit
 
     @property
+    def noise_si(self) -> float:
+        """Stated rms noise in SI."""
+        return self.noise_rms * self.si_per_unit
+
+    @property
+    def lsb_si(self) -> float:
+        """One step of the A/D converter in SI."""
+        return 2.0 * self.range_si / 2.0**self.bits
+
+    @property
     def volts_per_si(self) -> float:
         return self.volts_per_unit / self.si_per_unit
 

@@ -272,7 +272,7 @@ def _suggest_level(rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfi
     history = [row for row in rows if math.isnan(row.frequency_hz)]
     bounds = [(limit.demand, limit.allowed) for limit in list_limits(rig)]
     bounds += [
-        (TABLE_SENSORS[sensor.channel], sensor.range * sensor.si_per_unit)
+        (TABLE_SENSORS[sensor.channel], sensor.range_si)
         for sensor in rig.sensors
         if sensor.channel in TABLE_SENSORS
     ]

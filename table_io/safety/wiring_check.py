@@ -23,7 +23,7 @@ from typing import Literal
 
 import numpy as np
 
-from table_io.block import Float1D, Float2D
+from table_io.block import Float1D, Float2D, finite_mean, finite_std
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
@@ -217,12 +217,12 @@ class RestingInputs:
     @cached_property
     def means(self) -> Float1D:
         """Mean of each channel, (channel,); NaN where it is lost."""
-        return np.array([_finite_mean(row) for row in self.values])
+        return np.array([finite_mean(row) for row in self.values])
 
     @cached_property
     def noise_rms(self) -> Float1D:
         """Noise rms of each channel about its mean, (channel,); NaN where it is lost."""
-        return np.array([_finite_std(row) for row in self.values])
+        return np.array([finite_std(row) for row in self.values])
 
     @cached_property
     def hum(self) -> MainsHum:
@@ -235,16 +235,6 @@ class RestingInputs:
         sensor = self.rig.sensors[row]
         rms = max(float(self.noise_rms[row]), sensor.lsb / math.sqrt(12.0))
         return math.log2(2.0 * sensor.range / (math.sqrt(12.0) * rms))
-
-
-def _finite_mean(row: Float1D) -> float:
-    finite = row[np.isfinite(row)]
-    return float(finite.mean()) if finite.size else math.nan
-
-
-def _finite_std(row: Float1D) -> float:
-    finite = row[np.isfinite(row)]
-    return float(finite.std()) if finite.size else math.nan
 
 
 def check_resting_inputs(resting: RestingInputs) -> tuple[CheckLine, ...]:
@@ -355,7 +345,7 @@ def _check_level(resting: RestingInputs, row: int, sensor: SensorConfig) -> Iter
         )
     values = resting.values[row]
     quarter = max(values.size // 4, 1)
-    first, last = _finite_mean(values[:quarter]), _finite_mean(values[-quarter:])
+    first, last = finite_mean(values[:quarter]), finite_mean(values[-quarter:])
     uncertainty = 6.0 * float(resting.noise_rms[row]) * math.sqrt(2.0 / quarter)
     limit = MAX_DRIFT_RANGE * sensor.range + uncertainty
     remedy = "it drifts: let it warm up, check its supply, and check that the table is at rest"
@@ -483,9 +473,8 @@ class TapResponse:
 
     def _rest_mean(self, channel: str) -> float:
         """Return the mean of a channel at rest; NaN without samples."""
-        row = self.values[self.rig.channels.index(channel)][: self.rest_samples]
-        finite = row[np.isfinite(row)]
-        return float(finite.mean()) if finite.size else math.nan
+        row = self.values[self.rig.channels.index(channel)]
+        return finite_mean(row[: self.rest_samples])
 
     def min_swing(self, channel: str) -> float:
         """Return the smallest detectable swing in the sensor's unit."""
@@ -586,7 +575,7 @@ def _check_tap(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLine]
     )
     largest_channel, min_size = _find_largest_swing(stimulus, response)
     for name in stimulus.channels:
-        sensor = response.rig.sensors[response.rig.channels.index(name)]
+        sensor = response.rig.sensor(name)
         first_swing = response.find_first_swing(name)
         if largest_channel not in stimulus.channels and registry[name].unit == unit:
             size = response.largest_swing(name)
@@ -615,10 +604,9 @@ def _find_largest_swing(stimulus: Stimulus, response: TapResponse) -> tuple[str,
     `size` is in the unit of the first channel of the stimulus.
     """
     registry = response.rig.channel_by_name
-    unit = response.rig.sensors[response.rig.channels.index(stimulus.channels[0])].si_per_unit
+    unit = response.rig.sensor(stimulus.channels[0]).si_per_unit
     sizes = {
-        name: response.rig.sensors[response.rig.channels.index(name)].si_per_unit
-        * response.largest_swing(name)
+        name: response.rig.sensor(name).si_per_unit * response.largest_swing(name)
         for name in _same_unit_channels(stimulus, response.rig)
         if registry[name].unit == registry[stimulus.channels[0]].unit
     }
@@ -629,7 +617,7 @@ def _find_largest_swing(stimulus: Stimulus, response: TapResponse) -> tuple[str,
 def _check_shunt(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLine]:
     """Check the shift caused by a shunt: sign and gain of the whole measuring chain."""
     name = stimulus.channels[0]
-    sensor = response.rig.sensors[response.rig.channels.index(name)]
+    sensor = response.rig.sensor(name)
     expected, tolerance = sensor.shunt or 0.0, sensor.shunt_tolerance or 0.0
     settled = response.swing(name)[find_tap_onset(stimulus, response) :]
     shift = float(settled[round((1.0 - SHUNT_READ_SHARE) * settled.size) :].mean())

@@ -321,8 +321,7 @@ class Laboratory:
 
     def _noise_rms(self, row: int) -> float:
         """Return the white noise of a sensor in SI."""
-        sensor = self._rig.sensors[row]
-        return sensor.noise_rms * sensor.si_per_unit
+        return self._rig.sensors[row].noise_si
 
 
 class LightSpotProfile:

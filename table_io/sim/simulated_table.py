@@ -203,7 +203,7 @@ class Digitizer:
             0.0 if w else s.offset * s.si_per_unit for s, w in zip(sensors, wired, strict=True)
         ]
         self._offset = column(offsets)
-        self._noise = column([s.noise_rms * s.si_per_unit for s in sensors])
+        self._noise = column([s.noise_si for s in sensors])
         self._half = column([2.0 ** (s.bits - 1) for s in sensors])
         self._step = column([abs(s.range * s.volts_per_unit) for s in sensors]) / self._half
 

@@ -5,8 +5,9 @@ from dataclasses import astuple, replace
 import numpy as np
 import pytest
 
-from table_io.block import Block, Float1D, recut_blocks
+from table_io.block import Block, Float1D
 from table_io.channels import CHANNELS, Channel
+from tests.builders.blocks import recut_blocks
 from tests.compare.test_twins import G4, measured, run_twins, shaken, twin
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.extra_channels import select_predicted

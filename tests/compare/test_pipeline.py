@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from table_io.acquisition.session import OperatorCommand, run_session
 from table_io.backends import open_backend
-from table_io.block import Block, Label, join_blocks, recut_blocks
+from table_io.block import Block, Label, join_blocks
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.records import (
@@ -26,6 +26,7 @@ from table_io.records import (
     PrcPoint,
     StepAdded,
 )
+from tests.builders.blocks import recut_blocks
 from twin.compare import pipeline
 from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import Item, encode_item

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from table_io.block import recut_blocks
+from tests.builders.blocks import recut_blocks
 from tests.compare.test_twins import G4, RATE_HZ, measured, run_twins, shaken, track
 from twin.compare.sensors import delay_signal
 from twin.compare.twins import TwinSetup, advance_twins

@@ -8,8 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from table_io.block import Block, Float1D, Float2D, join_blocks, recut_blocks
+from table_io.block import Block, Float1D, Float2D, join_blocks
 from table_io.records import Comparison
+from tests.builders.blocks import recut_blocks
 from twin.compare import COMPARED_CHANNELS, PREDICTED_CHANNELS
 from twin.compare.twins import (
     HISTORY_S,

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.block import Block, recut_blocks
+from table_io.block import Block
 from table_io.records import RunStop
+from tests.builders.blocks import recut_blocks
 from tests.monitor.monitored import LEVEL, RATE, RUN, block, point, receive, records, start, stream
 from twin.monitor.page_data import build_sections
 from twin.monitor.recent import MAX_TRACE_POINTS, MAX_TRACE_S, TraceBuffer

@@ -54,7 +54,7 @@ class Target:
 
 TARGETS = {
     "consistency": Target(
-        ("table_io/safety/protection/consistency.py",),
+        ("table_io/safety/consistency.py",),
         ("tests/table_io/safety/test_consistency.py",),
     ),
     "protection": Target(

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from table_io.block import Block, join_blocks, recut_blocks
+from table_io.block import Block, join_blocks
+from tests.builders.blocks import recut_blocks
 
 RATE_HZ = 2000.0
 CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")

@@ -190,7 +190,7 @@ def test_fingerprints_are_the_same_in_every_process() -> None:
 def list_kernels() -> list[Any]:
     """Return the kernels of this package that are kept on disk, in the order of their modules."""
     from table_io import sensor_errors
-    from table_io.safety.protection import sample_checks
+    from table_io.safety import sample_checks
     from table_io.sim import plant
     from twin.dynamics import closed_form_map
     from twin.earthquakes import table_model

@@ -7,8 +7,8 @@ import pytest
 from scipy import signal
 
 from table_io.block import Float1D
-from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
-from table_io.safety.protection.cycle_checks import MIN_BASELINE_CHECKS
+from table_io.safety.consistency import WeakFormPair, compare_motion, make_window
+from table_io.safety.cycle_checks import MIN_BASELINE_CHECKS
 from table_io.sensor_errors import (
     MAX_LOW_CUT_RAD_S,
     PairErrorEstimate,

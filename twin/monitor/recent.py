@@ -170,7 +170,7 @@ def compute_live_margins(
     """Compute one margin per sensor, then velocity and force of the table; the tightest limit each.
 
     A sensor range applies to the reading including tare, a table limit to the motion. Velocity and
-    force as in `table_io.safety.protection.sample_checks`.
+    force as in `table_io.safety.sample_checks`.
     """
     channels, values = recent.last_second()
     limits = rig.limits

@@ -253,7 +253,7 @@ def test_rig_files_are_read_without_any_vendor_library() -> None:
     code = (
         "import sys\n"
         "from table_io.config.base import PROFILES_DIR\n"
-        "from table_io.config.rig import load_rig\n"
+        "from table_io.config.rig_file import load_rig\n"
         "rigs = [load_rig(path)[0] for path in (PROFILES_DIR / 'rigs').glob('*.toml')]\n"
         "assert len({rig.backend for rig in rigs}) == 5\n"
         "late = {'nidaqmx', 'grpc', 'opendaq', 'table_io.sim.simulated_table', 'numba'}\n"

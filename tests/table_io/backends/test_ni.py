@@ -505,7 +505,7 @@ def test_without_the_library_it_says_what_to_install() -> None:
         "from table_io.backends import check_reachable\n"
         "from table_io.config.folders import find_config\n"
         "from table_io.errors import InputError\n"
-        "from table_io.config.rig import load_rig\n"
+        "from table_io.config.rig_file import load_rig\n"
         "rig, _ = load_rig(find_config('ni_simulated', 'rigs'))\n"
         "try: check_reachable(rig)\n"
         "except InputError as error: print(error)\n"

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from table_io.control.order_tracking import evaluate_gain, evaluate_transfer
 from table_io.records import FrequencyResponse
-from table_io.safety.loop_check import evaluate_gain, evaluate_transfer
 
 
 def double_pole(f: float, corner_hz: float = 31.0, delay_s: float = 5e-3) -> complex:

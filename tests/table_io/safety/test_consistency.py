@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from table_io.safety.protection.consistency import (
+from table_io.safety.consistency import (
     MIN_AMPLITUDE_RATIO,
     MIN_AMPLITUDE_SNR,
     WeakFormPair,

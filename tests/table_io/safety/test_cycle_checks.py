@@ -15,19 +15,25 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_transfer
 from table_io.records import FrequencyResponse
-from table_io.safety import protection
+from table_io.safety import cycle_checks, protection
+from table_io.safety.consistency import SENSOR_PAIRS, WeakFormPair, compare_motion
+from table_io.safety.cycle_checks import (
+    DriveCycle,
+    ForceShare,
+    PairBaseline,
+    ProtectionContext,
+    SwingAverage,
+    check_cell_pairs,
+)
+from table_io.safety.findings import Suspicion
 from table_io.safety.protection import (
-    confirmation,
-    cycle_checks,
+    CycleCheckState,
+    SampleSpan,
+    check_cycle,
     set_response,
     start_protection,
 )
-from table_io.safety.protection.confirmation import CycleCheckState, SampleSpan, check_cycle
-from table_io.safety.protection.consistency import WeakFormPair, compare_motion
-from table_io.safety.protection.cycle import DriveCycle, ProtectionContext, Suspicion
-from table_io.safety.protection.cycle_checks import PairBaseline, SwingAverage
-from table_io.safety.protection.load_cells import ForceShare, check_cell_pairs
-from table_io.safety.protection.sample_checks import TABLE_GAIN, TABLE_LAG
+from table_io.safety.sample_checks import TABLE_GAIN, TABLE_LAG
 from table_io.sensor_errors import PairErrorEstimate, PairErrors, highpass
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_history_profile, make_profile
@@ -299,9 +305,9 @@ def test_check_response_of_both_sensors(
 # Laws of the comparison of a displacement with an acceleration
 
 PAIRS = [
-    (RIG, cycle_checks.SENSOR_PAIRS[0], 2.0),
-    (RIG, cycle_checks.SENSOR_PAIRS[1], 5.0),
-    (REL_RIG, cycle_checks.SENSOR_PAIRS[2], 5.0),
+    (RIG, SENSOR_PAIRS[0], 2.0),
+    (RIG, SENSOR_PAIRS[1], 5.0),
+    (REL_RIG, SENSOR_PAIRS[2], 5.0),
 ]
 
 
@@ -682,8 +688,8 @@ def test_check_cycle_joins_the_fewest_spans(rig: RigConfig, counts: list[int]) -
             len(sizes),
         )
         assert [item.phase.size for item in state.spans] == sizes[-fewest:]
-        assert confirmation._count_cycles(spans) == pytest.approx(first / CYCLE_SAMPLES)
-        cycle = confirmation._join_spans(context, list(state.spans))
+        assert protection._count_cycles(spans) == pytest.approx(first / CYCLE_SAMPLES)
+        cycle = protection._join_spans(context, list(state.spans))
         begin = first - sum(sizes[-fewest:])
         expected = np.arange(begin, first) / CYCLE_SAMPLES + 0.3
         assert cycle.phase == pytest.approx(expected - math.floor(expected[0]))
@@ -692,7 +698,7 @@ def test_check_cycle_joins_the_fewest_spans(rig: RigConfig, counts: list[int]) -
         assert cycle.values[TABLE] == pytest.approx(cycle.command)
         # The high-pass runs on from span to span as over all samples in one.
         joined = np.concatenate([item.values for item in spans], axis=1)
-        for names, acceleration in cycle_checks.SENSOR_PAIRS:
+        for names, acceleration in SENSOR_PAIRS:
             if not {*names, acceleration} <= {*rig.channels}:
                 assert names[0] not in state.spans[-1].filtered
                 continue

@@ -19,19 +19,20 @@ from table_io.clock import ManualClock
 from table_io.config.calibration import command_to_volts, compute_tare, measure_noise, volts_to_si
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.control.order_tracking import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory, start_trajectory
 from table_io.records import Check
 from table_io.safety.loop_check import (
+    MIN_TONE_SNR,
     REMEDIES,
     SETTLE_CYCLES,
     count_hold_cycles,
     evaluate,
-    evaluate_transfer,
     find_remedy,
     plan_targets,
+    unwrap_phase,
 )
-from table_io.safety.loop_check.checks import MIN_TONE_SNR, unwrap_phase
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segments
 from tests.builders.profiles import list_shipped_sweeps, read_shipped_profile

@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 
 from table_io.block import Block, Label
 from table_io.config.profile import ProtectionConfig
-from table_io.safety import protection
-from table_io.safety.protection import sample_checks
-from table_io.safety.protection.findings import to_finding
-from table_io.safety.protection.sample_checks import (
+from table_io.safety import protection, sample_checks
+from table_io.safety.findings import to_finding
+from table_io.safety.sample_checks import (
     ACCELERATION,
     BLIND,
     COMMAND,
@@ -41,13 +40,10 @@ from table_io.safety.protection.sample_checks import (
     TABLE_LAG,
     UNKNOWN_LAG,
     VELOCITY,
-)
-from table_io.safety.protection.thresholds import (
     SampleCheckState,
-    Thresholds,
-    compute_thresholds,
     make_sample_state,
 )
+from table_io.safety.thresholds import Thresholds, compute_thresholds
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_profile
 from tests.builders.rigs import NOISE_SI, RIG

@@ -1,23 +1,126 @@
-"""Cycle checks: level, response, drift and sensor consistency over one whole cycle.
+"""Cycle checks: level, response, drift, sensors and load cells over one whole cycle of the drive.
 
 Each function yields suspicions; one that persists over several checks becomes a finding.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Label
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import track_harmonics
-from table_io.safety.protection.consistency import (
+from table_io.control.order_tracking import HarmonicFit, track_channels, track_harmonics
+from table_io.safety.consistency import (
+    MAX_CELL_OFFSET_RATIO,
+    CellPairFit,
     WeakFormPair,
+    WeakFormWindow,
     compare_motion,
+    fit_cell_pair,
+    make_window,
+    remove_spikes,
 )
-from table_io.safety.protection.cycle import TRACKED_HARMONICS, DriveCycle, Suspicion, suspect_drift
+from table_io.safety.findings import Suspicion, format_si, suspect_drift
 from table_io.sensor_errors import AVERAGING_CHECKS, PairErrorEstimate, PairErrors
+
+TRACKED_HARMONICS = 5  # separated from the fundamental of the table's motion
+
+
+@dataclass(frozen=True, eq=False)
+class ProtectionContext:
+    """Profile, rig, and noise of its sensors at rest: rms and spike threshold, SI, (channel,)."""
+
+    profile: Profile
+    rig: RigConfig
+    sigma: Float1D  # (channel,)
+    spike_limit: Float1D
+
+    @property
+    def rate_hz(self) -> float:
+        return self.profile.acquisition.rate_hz
+
+    def range_si(self, name: str) -> float:
+        """Return the full-scale range of a sensor on either side, SI."""
+        return self.rig.sensor(name).range_si
+
+
+@dataclass(frozen=True, eq=False)
+class DriveCycle:
+    """About one cycle of the drive: values (channel, sample), command and phase (sample,).
+
+    The phase is unwrapped; `level` and `label` are those of the last sample.
+    """
+
+    context: ProtectionContext
+    values: Float2D
+    command: Float1D
+    phase: Float1D
+    level: float
+    label: int
+
+    @cached_property
+    def _clean_values(self) -> Float2D:
+        return remove_spikes(self.values, self.context.spike_limit[:, None])
+
+    @cached_property
+    def _complete_channels(self) -> frozenset[str]:
+        rows = np.flatnonzero(~np.isnan(self.values).any(axis=1)).tolist()
+        return frozenset(self.context.rig.channels[row] for row in rows)
+
+    @cached_property
+    def tones(self) -> dict[str, HarmonicFit]:
+        """Harmonics of the command ("command"), of its read-back and of the table's channels."""
+        names = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
+        rows = [*(self.clean_channel(name) for name in names), self.command]
+        tracked = track_channels(np.array(rows), self.phase, TRACKED_HARMONICS)
+        return dict(zip((*names, "command"), tracked, strict=True))
+
+    @cached_property
+    def window(self) -> WeakFormWindow:
+        """Test functions over the cycle."""
+        middle = 0.5 * float(self.phase[0] + self.phase[-1])
+        return make_window(self.phase.size, self.cycle_count, middle, self.context.rate_hz)
+
+    def has(self, *names: str) -> bool:
+        """Return True if the rig has these channels and no sample of them is lost."""
+        return self._complete_channels.issuperset(names)
+
+    def clean_channel(self, name: str) -> Float1D:
+        """Return a channel with spikes of one sample removed, (sample,)."""
+        row: Float1D = self._clean_values[self.context.rig.channels.index(name)]
+        return row
+
+    @property
+    def cycle_count(self) -> float:
+        """Cycles of the drive, including the interval after the last sample."""
+        count = self.phase.size
+        return float(self.phase[-1] - self.phase[0]) * count / (count - 1)
+
+    @property
+    def omega(self) -> float:
+        """Angular frequency, rad/s."""
+        return 2 * math.pi * self.cycle_count * self.context.rate_hz / self.phase.size
+
+    def sigma(self, *names: str) -> float:
+        """Return the rms noise of a sum of channels."""
+        return math.hypot(
+            *(self.context.sigma[self.context.rig.channels.index(name)] for name in names)
+        )
+
+    def relative_displacement(self) -> Float1D | None:
+        """Return u in m, right positive, (sample,); None where it is not measured."""
+        if self.has("rel_disp_m"):
+            return self.clean_channel("rel_disp_m")
+        if self.has("mass_disp_m", "table_disp_m"):
+            return self.clean_channel("mass_disp_m") - self.clean_channel("table_disp_m")
+        return None
+
 
 MAX_MISMATCH_RATIO = 0.12  # of the motion; slightly more than the limit of the loop check
 MAX_MISMATCH_CHANGE = 0.05  # of the motion; change from the errors of the last ten cycles
@@ -29,11 +132,6 @@ MAX_READ_BACK_ERROR = 0.02  # of the command
 MAX_GAIN_CHANGE = 0.2  # of the identified response
 MAX_LAG_CHANGE_RATIO, MAX_LAG_CHANGE_S = 0.5, 0.003  # of the identified lag, and absolute minimum
 MAX_SWING_ASYMMETRY = 0.35  # of the swing of the mass: twice that of the chaotic case G4
-SENSOR_PAIRS = (
-    (("table_disp_m",), "table_acc_m_s2"),
-    (("mass_disp_m",), "mass_acc_m_s2"),
-    (("rel_disp_m", "table_disp_m"), "mass_acc_m_s2"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,3 +388,120 @@ def payload_deflection(cycle: DriveCycle, lag_s: float) -> float:
 def phase_lag_s(ratio: complex, omega: float) -> float:
     """Return the lag of a response in s."""
     return float(-np.angle(ratio)) / omega
+
+
+MIN_SWING_SIGMAS = 20.0  # times the noise: force from which sharing is evaluated
+BASELINE_CHECKS = 20  # ten cycles with contact, over which the baseline is averaged
+MAX_ANGLE_CHANGE_RAD = math.radians(3.0)  # a tenth more or less force on one of two cells
+MAX_UNEVEN_ANGLE_RAD = math.radians(
+    25.0
+)  # from equal shares while there is no baseline: one cell bears a third of the other
+
+
+@dataclass(frozen=True, slots=True)
+class ForceShare:
+    """Baseline of force sharing on a side: angle in rad and means in N, over `check_count`."""
+
+    angle: float
+    means: tuple[float, float]
+    check_count: int = 1
+
+    def update(self, fit: CellPairFit) -> "ForceShare":
+        """Return the baseline with one more fit; fixed after BASELINE_CHECKS."""
+        if self.check_count >= BASELINE_CHECKS:
+            return self
+        weight = 1.0 / (self.check_count + 1)
+        angle = self.angle + weight * (fit.angle - self.angle)
+        first, second = (
+            mean + weight * (new - mean) for mean, new in zip(self.means, fit.means, strict=True)
+        )
+        return ForceShare(angle, (first, second), self.check_count + 1)
+
+
+def check_cell_pairs(
+    cycle: DriveCycle, shares: Mapping[str, ForceShare]
+) -> tuple[list[Suspicion], dict[str, ForceShare]]:
+    """Check the load cells of both sides: return (suspicions, force sharing by side)."""
+    suspicions: list[Suspicion] = []
+    updated = dict(shares)
+    u = cycle.relative_displacement()
+    gaps = cycle.context.profile.specimen.gaps_m
+    for side, sign, gap in ((RIGHT_CELLS, 1.0, gaps[0]), (LEFT_CELLS, -1.0, gaps[1])):
+        present = [name for name in side if cycle.has(name)]
+        if u is not None and gap > 0:
+            bearing = list(_check_unloaded_cells(cycle, present, sign * u < 0))
+            suspicions += (
+                bearing if len(bearing) < max(len(present), 2) else [_suspect_displacement(bearing)]
+            )
+        if len(present) < 2:
+            continue
+        noise = max(cycle.sigma(name) for name in side)
+        fit = fit_cell_pair(cycle.clean_channel(side[0]), cycle.clean_channel(side[1]), noise)
+        if fit.rms > MIN_SWING_SIGMAS * noise and fit.rms > 0:
+            share = updated.get(side[0])
+            changes = list(_check_share_change(cycle, side, fit, share))
+            if not changes:
+                updated[side[0]] = share.update(fit) if share else ForceShare(fit.angle, fit.means)
+            suspicions += changes
+    return suspicions, updated
+
+
+def _check_unloaded_cells(
+    cycle: DriveCycle, names: list[str], free: npt.NDArray[np.bool_]
+) -> Iterator[Suspicion]:
+    """Check that cells bear no force while the mass is on the other side of the middle.
+
+    With a positive gap there is no contact then.
+    """
+    count = int(free.sum())
+    if count < 5:
+        return
+    for name in names:
+        force = float(cycle.clean_channel(name)[free].mean())
+        limit = MAX_CELL_OFFSET_RATIO * cycle.context.profile.comparison.contact_n
+        limit += 6.0 * cycle.sigma(name) / math.sqrt(count)
+        if abs(force) > limit:
+            yield suspect_drift(name, force, limit, "N")
+
+
+def _suspect_displacement(suspicions: list[Suspicion]) -> Suspicion:
+    """Suspect a displacement sensor where all cells of a side show force without contact."""
+    first = suspicions[0]
+    text = (
+        f"{' and '.join(suspicion.channel for suspicion in suspicions)} bear "
+        f"{format_si(first.value, 'N')} on the other side of the gap: the "
+        "displacement of the mass or of the table has drifted"
+    )
+    return Suspicion("drift", "mass_disp_m", first.value, first.limit, text)
+
+
+def _check_share_change(
+    cycle: DriveCycle, side: tuple[str, str], fit: CellPairFit, share: ForceShare | None
+) -> Iterator[Suspicion]:
+    """Yield a suspicion if two cells share the force of their side differently than before."""
+    expected, max_change = (
+        (share.angle, MAX_ANGLE_CHANGE_RAD) if share else (math.pi / 4, MAX_UNEVEN_ANGLE_RAD)
+    )
+    change = fit.angle - expected
+    if abs(change) > max_change + 6.0 * fit.sigma_angle:
+        # The cell with less force is suspected, although the other one may read too high.
+        channel = side[0] if fit.means[0] < fit.means[1] else side[1]
+        measured_percent, expected_percent = (
+            100 / (1 + math.tan(angle)) for angle in (fit.angle, expected)
+        )
+        text = f"{side[0]} bears {measured_percent:.0f} % of its sum with {side[1]}; "
+        text += f"expected: {expected_percent:.0f} %"
+        limit = expected + math.copysign(max_change, change)
+        yield Suspicion("share", channel, fit.angle, limit, text, group=side[0])
+        return
+    if share is None:
+        return
+    first, second = (
+        measured - baseline for measured, baseline in zip(fit.means, share.means, strict=True)
+    )
+    deviation = second * math.cos(share.angle) - first * math.sin(share.angle)
+    uncertainty = fit.sigma_angle / math.sqrt(share.check_count) * math.hypot(first, second)
+    limit = MAX_CELL_OFFSET_RATIO * cycle.context.profile.comparison.contact_n * math.sqrt(2.0)
+    limit += 6.0 * math.hypot(uncertainty, 2.0 * fit.sigma)
+    if abs(deviation) > limit:
+        yield suspect_drift(side[0] if deviation < 0 else side[1], abs(deviation), limit, "N")

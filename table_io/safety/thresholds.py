@@ -1,4 +1,4 @@
-"""Thresholds and state of the sample checks (`sample_checks.py`).
+"""Thresholds of the sample checks (`sample_checks.py`).
 
 Thresholds derive from the rig, the noise of each sensor at rest and the constants below.
 """
@@ -10,18 +10,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Float1D, Float2D, Int1D
+from table_io.block import Float1D
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig, TableResponse
-from table_io.config.sensor import SensorConfig
-from table_io.safety.protection.sample_checks import (
-    CHANNEL_ROWS,
-    CODE_COUNT,
-    LAST_MARK,
-    SCALAR_COUNT,
-    TABLE_LAG,
-    UNKNOWN_LAG,
-)
 from table_io.units import GRAVITY_M_S2
 
 HISTORY_S = 0.25  # of earlier samples: the longest repetition that is detected
@@ -101,14 +92,6 @@ class Thresholds(NamedTuple):
     min_rest_samples: float = 100.0  # needed to estimate the noise at rest
 
 
-class SampleCheckState(NamedTuple):
-    """State of the sample checks, updated in place by the kernel."""
-
-    channels: Float2D  # (row, channel)
-    scalars: Float1D  # (index,)
-    last_true: Int1D  # (code, channel): the last sample at which the code applied
-
-
 def compute_thresholds(
     profile: Profile, rig: RigConfig, noise: Mapping[str, tuple[float, int]]
 ) -> Thresholds:
@@ -121,7 +104,7 @@ def compute_thresholds(
     )
     sigma = np.where(np.isnan(rms), 0.0, rms)
     full_scale = np.array([sensor.range_si for sensor in rig.sensors])
-    lsb = np.array([_lsb(sensor) for sensor in rig.sensors])
+    lsb = np.array([sensor.lsb_si for sensor in rig.sensors])
     informative = (rms > 0) & (runs < MAX_REST_RUN_S * rate_hz)
     needed = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
     drive, table, acceleration = (names.index(name) for name in needed)
@@ -166,15 +149,3 @@ def compute_thresholds(
         initial_following_ratio=max(MAX_INITIAL_FOLLOWING_RATIO, following_ratio),
         following_ratio=following_ratio,
     )
-
-
-def _lsb(sensor: SensorConfig) -> float:
-    return 2 * sensor.range_si / 2**sensor.bits
-
-
-def make_sample_state(channels: int) -> SampleCheckState:
-    """Return the state before the first sample."""
-    scalars = np.zeros(SCALAR_COUNT)
-    scalars[TABLE_LAG], scalars[LAST_MARK] = UNKNOWN_LAG, -1.0
-    last_true = np.full((CODE_COUNT, channels), -(2**62), dtype=np.int64)
-    return SampleCheckState(np.zeros((CHANNEL_ROWS, channels)), scalars, last_true)

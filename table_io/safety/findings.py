@@ -6,14 +6,14 @@ from typing import NamedTuple
 from table_io.channels import Channel
 from table_io.config.profile import Profile
 from table_io.records import Event, Trip
-from table_io.safety.protection import sample_checks
-from table_io.safety.protection.cycle import Suspicion, format_si
+from table_io.safety import sample_checks as codes
 from table_io.units import GRAVITY_M_S2
 
-CONTROL_CHANNELS = frozenset(
-    {"drive_disp_m", "table_disp_m", "table_acc_m_s2"}
-)  # needed by the controller
+# Needed by the controller.
+CONTROL_CHANNELS = frozenset({"drive_disp_m", "table_disp_m", "table_acc_m_s2"})
 MACHINE_ALARM_KINDS = frozenset({"level", "response"})  # all other kinds are sensor faults
+# Checks are half a cycle apart, so the first and the last of three share no sample.
+CONFIRMATION_CHECKS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +41,28 @@ class Finding:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Suspicion:
+    """Suspected fault from one cycle check, SI.
+
+    `severity` is "stop", "alarm" or "sensor" (stop or alarm, depending on the channel).
+    """
+
+    kind: str
+    channel: str
+    value: float
+    limit: float
+    text: str
+    severity: str = "sensor"
+    required_checks: int = CONFIRMATION_CHECKS
+    group: str = ""  # key shared by successive suspicions where the channel may change
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Key by which successive suspicions count as the same."""
+        return self.kind, self.group or self.channel, self.severity
+
+
 class Wording(NamedTuple):
     """Kind, severity and message template of a code of `sample_checks`.
 
@@ -57,67 +79,34 @@ class Wording(NamedTuple):
 
 _BEYOND = "{channel}: {value} at sample {at} exceeds {limit}"
 WORDINGS = {
-    sample_checks.STROKE: Wording("stroke", "stop", _BEYOND, "mm", 1e3),
-    sample_checks.VELOCITY: Wording(
-        "velocity",
-        "stop",
-        "the table moves at {value} at sample {at}; allowed: {limit}",
-        "mm/s",
-        1e3,
-    ),
-    sample_checks.ACCELERATION: Wording("acceleration", "stop", _BEYOND, "g", 1 / GRAVITY_M_S2),
-    sample_checks.FORCE: Wording(
-        "force",
-        "stop",
-        "the actuator force is {value} at sample {at}; allowed: {limit}",
-        "kN",
-        1e-3,
-    ),
-    sample_checks.RAIL: Wording("rail", "sensor", "{channel} saturates at {limit} at sample {at}"),
-    sample_checks.LOST: Wording("lost", "alarm", "{channel} is lost at sample {at}"),
-    sample_checks.DROPPED: Wording("lost", "alarm", "all channels are lost at sample {at}"),
-    sample_checks.BLIND: Wording(
-        "lost",
-        "sensor",
-        "{channel} is lost for {value} at sample {at}; allowed: {limit}",
-        "ms",
-        1e3,
-    ),
-    sample_checks.STUCK: Wording(
-        "stuck", "sensor", "{channel} has not changed for {value} samples at sample {at}", " ", 1.0
-    ),
-    sample_checks.SILENT: Wording(
-        "silent",
-        "sensor",
+    codes.STROKE: Wording("stroke", "stop", _BEYOND, "mm", 1e3),
+    codes.VELOCITY: Wording("velocity", "stop",
+        "the table moves at {value} at sample {at}; allowed: {limit}", "mm/s", 1e3),
+    codes.ACCELERATION: Wording("acceleration", "stop", _BEYOND, "g", 1 / GRAVITY_M_S2),
+    codes.FORCE: Wording("force", "stop",
+        "the actuator force is {value} at sample {at}; allowed: {limit}", "kN", 1e-3),
+    codes.RAIL: Wording("rail", "sensor", "{channel} saturates at {limit} at sample {at}"),
+    codes.LOST: Wording("lost", "alarm", "{channel} is lost at sample {at}"),
+    codes.DROPPED: Wording("lost", "alarm", "all channels are lost at sample {at}"),
+    codes.BLIND: Wording("lost", "sensor",
+        "{channel} is lost for {value} at sample {at}; allowed: {limit}", "ms", 1e3),
+    codes.STUCK: Wording("stuck", "sensor",
+        "{channel} has not changed for {value} samples at sample {at}", " "),
+    codes.SILENT: Wording("silent", "sensor",
         "{channel} shows less noise than at rest at sample {at}: {value} rms; expected: at least "
-        "{limit}; check its cable",
-    ),
-    sample_checks.SPIKE: Wording(
-        "spike", "alarm", "{channel}: sample {at} deviates by {value} from its neighbors"
-    ),
-    sample_checks.REPEATED: Wording(
-        "repeated",
-        "alarm",
+        "{limit}; check its cable"),
+    codes.SPIKE: Wording("spike", "alarm",
+        "{channel}: sample {at} deviates by {value} from its neighbors"),
+    codes.REPEATED: Wording("repeated", "alarm",
         "the samples up to {at} repeat those {value} earlier; they are not new measurements",
-        "ms",
-        1e3,
-    ),
-    sample_checks.COMMAND: Wording(
-        "command",
-        "stop",
+        "ms", 1e3),
+    codes.COMMAND: Wording("command", "stop",
         "the command read back differs by {value} from the queued one at sample {at}; "
-        "allowed: {limit}",
-        "mm",
-        1e3,
-    ),
-    sample_checks.FOLLOWING: Wording(
-        "following",
-        "stop",
+        "allowed: {limit}", "mm", 1e3),
+    codes.FOLLOWING: Wording("following", "stop",
         "the table deviates by {value} from its command at sample {at}; allowed: {limit}",
-        "mm",
-        1e3,
-    ),
-}
+        "mm", 1e3),
+}  # fmt: skip
 
 
 def to_finding(
@@ -149,3 +138,14 @@ def _is_stop(severity: str, channel: str, profile: Profile) -> bool:
     if severity == "sensor":
         return channel in CONTROL_CHANNELS or profile.protection.sensor == "stop"
     return severity == "stop"
+
+
+def format_si(value: float, unit: str) -> str:
+    """Format a value with its unit, m as mm."""
+    return f"{1e3 * value:.4g} mm" if unit == "m" else f"{value:.4g} {unit}".strip()
+
+
+def suspect_drift(channel: str, value: float, limit: float, unit: str) -> Suspicion:
+    """Make the suspicion that a sensor has drifted by `value`."""
+    text = f"{channel} has drifted by {format_si(value, unit)}; allowed: {format_si(limit, unit)}"
+    return Suspicion("drift", channel, value, limit, text)

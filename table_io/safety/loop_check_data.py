@@ -12,12 +12,12 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Block, Float1D, Label
+from table_io.block import Block, Float1D, Label, finite_std
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import track_channels, track_harmonics
 from table_io.excitation.drive import Drive, Segment
-from table_io.safety.protection.consistency import WeakFormPair, compare_motion, make_window
+from table_io.safety.consistency import WeakFormPair, compare_motion, make_window
 from table_io.sensor_errors import PairErrors, highpass, solve_errors
 
 Complex1D = npt.NDArray[np.complex128]
@@ -235,18 +235,8 @@ class LoopCheckData:
 
     def noise(self, name: str) -> float:
         """Return the rms of a channel at rest about its mean, SI; at least its rounding noise."""
-        rest_rms = _finite_std(self.rest_before.channel(name))
-        rounding = self.lsb(name) / math.sqrt(12.0)
+        rest_rms = finite_std(self.rest_before.channel(name))
+        rounding = self.rig.sensor(name).lsb_si / math.sqrt(12.0)
         return (
             max(rest_rms, self.tare_noise.get(name, 0.0), rounding) if rest_rms >= 0 else math.nan
         )
-
-    def lsb(self, name: str) -> float:
-        """Return one step of a channel's converter, SI."""
-        sensor = next(sensor for sensor in self.rig.sensors if sensor.channel == name)
-        return 2.0 * sensor.range_si / 2.0**sensor.bits
-
-
-def _finite_std(values: Float1D) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.std()) if finite.size else math.nan

@@ -28,6 +28,13 @@ MIN_AMPLITUDE_SNR, MIN_AMPLITUDE_RATIO = (
     20.0,
     0.3,
 )  # amplitude over its standard error, and over the motion, from which a ratio is evaluated
+# Displacements, which add up, and the acceleration of one body.
+SENSOR_PAIRS = (
+    (("table_disp_m",), "table_acc_m_s2"),
+    (("mass_disp_m",), "mass_acc_m_s2"),
+    (("rel_disp_m", "table_disp_m"), "mass_acc_m_s2"),
+)
+MAX_CELL_OFFSET_RATIO = 0.5  # of the contact threshold: force of a cell without contact
 Complex1D = npt.NDArray[np.complex128]
 
 

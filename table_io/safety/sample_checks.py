@@ -1,0 +1,333 @@
+"""Sample checks: limits, broken sensors, and tracking errors of command and table, every sample.
+
+One compiled kernel moves from sample to sample, so results do not depend on the division into
+blocks. Limits apply to the median of the three newest samples: it rejects electrical spikes of one
+sample and delays the detection of a real excess by one sample.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D, Int1D
+from table_io.compilation import inline_jit, jit_untyped_kernel
+from table_io.safety.thresholds import Thresholds
+
+# Codes of findings.
+STROKE, VELOCITY, ACCELERATION, FORCE, RAIL, LOST, BLIND = range(7)
+STUCK, SILENT, SPIKE, REPEATED, COMMAND, FOLLOWING, DROPPED = range(7, 14)
+CODE_COUNT = 14
+UNKNOWN_LAG = -1.0  # lag of the table before its response is known
+LOOP_CHECK_KEY = -1.0  # motion key of the loop check
+SWEEP_STAGE = 1.0  # RUN_STAGE from the first step on; before it only gross deviations stop
+HALF_CYCLE, NEW_MOTION = 1, 2  # marks: half a cycle is complete, another motion begins
+# Rows of the state per channel.
+RUN_LENGTH, RUN_ORIGIN, EXPECTED_MOTION, NOISE_POWER = range(4)
+REST_POWER, REST_COUNT, LOST_COUNT, RAIL_COUNT = range(4, 8)
+CHANNEL_ROWS = 8
+# Indices of the scalar state.
+COMMAND_PEAK, CYCLE_FRACTION, MOTION_KEY, RUN_STAGE, TABLE_GAIN, TABLE_LAG = range(6)
+REPEAT_DISTANCE, REPEAT_COUNT, COMMAND_ERROR_COUNT, FOLLOWING_ERROR_COUNT = range(6, 10)
+LAST_MARK, PAYLOAD_PEAK = 10, 11
+SCALAR_COUNT = 12
+
+
+class SampleCheckState(NamedTuple):
+    """State of the sample checks, updated in place by the kernel."""
+
+    channels: Float2D  # (row, channel)
+    scalars: Float1D  # (index,)
+    last_true: Int1D  # (code, channel): the last sample at which the code applied
+
+    def copy(self) -> "SampleCheckState":
+        return SampleCheckState(self.channels.copy(), self.scalars.copy(), self.last_true.copy())
+
+
+def make_sample_state(channels: int) -> SampleCheckState:
+    """Return the state before the first sample."""
+    scalars = np.zeros(SCALAR_COUNT)
+    scalars[TABLE_LAG], scalars[LAST_MARK] = UNKNOWN_LAG, -1.0
+    last_true = np.full((CODE_COUNT, channels), -(2**62), dtype=np.int64)
+    return SampleCheckState(np.zeros((CHANNEL_ROWS, channels)), scalars, last_true)
+
+
+class _CheckRun(NamedTuple):
+    """What all checks of a call share; `found[0]` is their number."""
+
+    limits: Thresholds
+    state: SampleCheckState
+    findings: Float2D  # rows of sample, code, channel, value, limit
+    found: Int1D
+
+
+@inline_jit
+def _median(row, i):  # type: ignore[no-untyped-def]
+    """Return the median of the samples i - 2 .. i; NaN if one of them is NaN."""
+    a, b, c = row[i - 2], row[i - 1], row[i]
+    if math.isnan(a) or math.isnan(b) or math.isnan(c):
+        return math.nan
+    return max(min(a, b), min(max(a, b), c))
+
+
+@inline_jit
+def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
+    """Add a finding, once per episode."""
+    last_index, count = run.state.last_true[code, channel], run.found[0]
+    run.state.last_true[code, channel] = index
+    if index - last_index <= run.limits.episode_samples or count == run.findings.shape[0]:
+        return
+    finding = run.findings[count]
+    finding[0], finding[1], finding[2] = index, code, channel
+    finding[3], finding[4] = value, limit
+    run.found[0] = count + 1
+
+
+@inline_jit
+def _report_beyond(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
+    """Add a finding if a value exceeds its limit on either side."""
+    if abs(value) > limit:
+        _report(run, index, code, channel, value, limit)
+
+
+@inline_jit
+def _check_delivery(values, clipped, i, index, repeated, run):  # type: ignore[no-untyped-def]
+    """Detect samples at the sensor's range and lost samples; count repeated ones as lost."""
+    limits, channels, dropped = run.limits, run.state.channels, True
+    for c in range(values.shape[0]):
+        dropped = dropped and math.isnan(values[c, i])
+    if dropped:
+        _report(run, index, DROPPED, limits.drive_row, math.nan, 0.0)
+    for c in range(values.shape[0]):
+        x = values[c, i]
+        channels[RAIL_COUNT, c] = channels[RAIL_COUNT, c] + 1.0 if clipped[c] else 0.0
+        if channels[RAIL_COUNT, c] >= limits.rail_run:
+            _report(run, index, RAIL, c, x, limits.full_scale[c])
+        lost = math.isnan(x)
+        if lost and not dropped:
+            _report(run, index, LOST, c, x, 0.0)
+        change = 1.0 if lost or repeated else -limits.loss_decay
+        channels[LOST_COUNT, c] = max(channels[LOST_COUNT, c] + change, 0.0)
+        if channels[LOST_COUNT, c] > limits.max_lost:
+            lost_s = channels[LOST_COUNT, c] / limits.rate_hz
+            _report(run, index, BLIND, c, lost_s, limits.max_lost / limits.rate_hz)
+
+
+@inline_jit
+def _check_stuck(values, i, index, command, demanded, run):  # type: ignore[no-untyped-def]
+    """Detect stuck channels: runs of equal samples."""
+    limits, channels = run.limits, run.state.channels
+    for c in range(values.shape[0]):
+        expected = demanded if c == limits.acceleration_row else command
+        if values[c, i] != values[c, i - 1]:
+            channels[RUN_LENGTH, c] = 1.0
+            channels[RUN_ORIGIN, c] = expected
+            channels[EXPECTED_MOTION, c] = 0.0
+            continue
+        channels[RUN_LENGTH, c] += 1.0
+        length = channels[RUN_LENGTH, c]
+        motion = max(channels[EXPECTED_MOTION, c], abs(expected - channels[RUN_ORIGIN, c]))
+        channels[EXPECTED_MOTION, c] = motion
+        must_change = motion >= limits.visible_motion[c] and length >= limits.visible_run
+        if must_change or length >= limits.stuck_run[c]:
+            _report(run, index, STUCK, c, length, min(limits.stuck_run[c], length))
+
+
+@inline_jit
+def _check_silence(values, i, index, run):  # type: ignore[no-untyped-def]
+    """Detect channels whose noise, from second differences, fell below that at rest."""
+    limits, channels = run.limits, run.state.channels
+    for c in range(values.shape[0]):
+        power = (values[c, i] - 2.0 * values[c, i - 1] + values[c, i - 2]) ** 2
+        if math.isnan(power):
+            continue
+        if run.state.scalars[RUN_STAGE] == 0.0:
+            channels[REST_POWER, c] += power
+            channels[REST_COUNT, c] += 1.0
+        if not limits.has_noise[c] or channels[REST_COUNT, c] < limits.min_rest_samples:
+            continue
+        rest_power = channels[REST_POWER, c] / channels[REST_COUNT, c]
+        if channels[NOISE_POWER, c] == 0.0:
+            channels[NOISE_POWER, c] = rest_power
+        channels[NOISE_POWER, c] += (
+            min(power, limits.max_power_ratio * rest_power) - channels[NOISE_POWER, c]
+        ) / limits.noise_window
+        least_power = limits.silence_ratio * rest_power
+        if channels[NOISE_POWER, c] < least_power:
+            # The second difference of white noise has six times the power of the noise.
+            rms = math.sqrt(channels[NOISE_POWER, c] / 6.0)
+            _report(run, index, SILENT, c, rms, math.sqrt(least_power / 6.0))
+
+
+@inline_jit
+def _check_spikes(values, i, index, run):  # type: ignore[no-untyped-def]
+    """Detect a spike at sample i - 1 in exactly one channel; real motion shows in others too."""
+    row, deviation, spike_count = -1, 0.0, 0
+    for c in range(values.shape[0]):
+        distance = abs(values[c, i - 1] - _median(values[c], i))
+        if distance > run.limits.spike_limit[c]:
+            row, deviation, spike_count = c, distance, spike_count + 1
+    if spike_count == 1:
+        _report(run, index - 1, SPIKE, row, deviation, run.limits.spike_limit[row])
+
+
+@inline_jit
+def _check_limits(values, i, index, run):  # type: ignore[no-untyped-def]
+    """Check stroke, velocity, acceleration and force of the table."""
+    limits = run.limits
+    table, acceleration_row = limits.table_row, limits.acceleration_row
+    displacement = _median(values[table], i)
+    earlier = _median(values[table], i - limits.velocity_span)
+    velocity = (displacement - earlier) * limits.rate_hz / limits.velocity_span
+    acceleration = _median(values[acceleration_row], i)
+    force = limits.table_kg * acceleration
+    if limits.mass_row >= 0:
+        mass_acceleration = _median(values[limits.mass_row], i)
+        force += 0.0 if math.isnan(mass_acceleration) else limits.mass_kg * mass_acceleration
+    _report_beyond(run, index, STROKE, table, displacement, limits.stroke_m)
+    _report_beyond(run, index, VELOCITY, table, velocity, limits.velocity_m_s)
+    max_acceleration = limits.acceleration_m_s2
+    _report_beyond(run, index, ACCELERATION, acceleration_row, acceleration, max_acceleration)
+    _report_beyond(run, index, FORCE, acceleration_row, force, limits.force_n)
+
+
+@inline_jit
+def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
+    """Return True if the last samples repeat earlier ones in every noisy channel."""
+    for distance in range(max(int(scalars[REPEAT_DISTANCE]), 1), limits.history):
+        noisy_count, is_same = 0, True
+        for c in range(values.shape[0]):
+            if limits.has_noise[c]:
+                noisy_count += 1
+                if values[c, i] != values[c, i - distance]:
+                    is_same = False
+                    break
+        if is_same and noisy_count >= 2:
+            scalars[REPEAT_COUNT] = (
+                scalars[REPEAT_COUNT] + 1.0 if distance == scalars[REPEAT_DISTANCE] else 1.0
+            )
+            scalars[REPEAT_DISTANCE] = distance
+            return scalars[REPEAT_COUNT] >= limits.repeat_run
+    scalars[REPEAT_DISTANCE], scalars[REPEAT_COUNT] = 0.0, 0.0
+    return False
+
+
+@inline_jit
+def _check_following(values, command, i, index, run):  # type: ignore[no-untyped-def]
+    """Compare the command read back and the position of the table with the queued command."""
+    limits, scalars, last_command = run.limits, run.state.scalars, command[i - 1]
+    in_loop_check = scalars[RUN_STAGE] < SWEEP_STAGE
+    error = _median(values[limits.drive_row], i) - last_command
+    ratio = limits.loop_check_ratio if in_loop_check else limits.command_ratio
+    limit = limits.command_tolerance_m + ratio * scalars[COMMAND_PEAK]
+    limit += 2.0 * abs(last_command - command[i - 2])
+    limit += limits.loop_check_tolerance_m if in_loop_check else 0.0
+    scalars[COMMAND_ERROR_COUNT] = scalars[COMMAND_ERROR_COUNT] + 1.0 if abs(error) > limit else 0.0
+    if scalars[COMMAND_ERROR_COUNT] >= limits.error_run:
+        _report(run, index, COMMAND, limits.drive_row, error, limit)
+    displacement = _median(values[limits.table_row], i)
+    error = _following_error(displacement, command, i, limits, scalars)
+    ratio = limits.following_ratio
+    if scalars[TABLE_LAG] == UNKNOWN_LAG:
+        ratio = limits.initial_following_ratio
+    if in_loop_check:
+        ratio = limits.loop_check_ratio
+    limit = limits.following_tolerance_m + ratio * scalars[COMMAND_PEAK]
+    if in_loop_check:
+        limit += limits.loop_check_tolerance_m
+    else:
+        limit += _payload_deflection(values, i, limits, scalars)
+    scalars[FOLLOWING_ERROR_COUNT] = scalars[FOLLOWING_ERROR_COUNT] + 1.0 if error > limit else 0.0
+    if scalars[FOLLOWING_ERROR_COUNT] >= limits.error_run:
+        _report(run, index, FOLLOWING, limits.table_row, error, limit)
+
+
+@inline_jit
+def _following_error(displacement, command, i, limits, scalars):  # type: ignore[no-untyped-def]
+    """Return the deviation of the table from the position that its command predicts, m.
+
+    While gain and lag are unknown, every position of the command within `max_lag` is accepted.
+    """
+    if scalars[TABLE_LAG] == UNKNOWN_LAG:
+        low, high = command[i - 1], command[i - 1]
+        for back in range(2, limits.max_lag + 1):
+            low, high = min(low, command[i - back]), max(high, command[i - back])
+        return max(low - displacement, displacement - high, 0.0)
+    delay = min(scalars[TABLE_LAG] * limits.rate_hz, limits.max_lag) + 1.0
+    whole_samples = int(delay)
+    fraction = delay - whole_samples
+    newer, older = command[i - whole_samples], command[i - whole_samples - 1]
+    return abs(displacement - scalars[TABLE_GAIN] * ((1.0 - fraction) * newer + fraction * older))
+
+
+@inline_jit
+def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-def]
+    """Return the possible table displacement caused by the specimen, m.
+
+    M / m a / p^2 with p = 2 / lag of a servo with a double pole p, and a the peak acceleration of
+    the mass over the last EPISODE_S or so.
+    """
+    if limits.mass_row < 0 or scalars[TABLE_LAG] == UNKNOWN_LAG:
+        return 0.0
+    a = _median(values[limits.mass_row], i)
+    if not math.isnan(a):
+        faded = scalars[PAYLOAD_PEAK] * (1.0 - 1.0 / limits.episode_samples)
+        scalars[PAYLOAD_PEAK] = max(abs(a), faded)
+    ratio = limits.mass_kg / limits.table_kg
+    return ratio * scalars[PAYLOAD_PEAK] * (0.5 * scalars[TABLE_LAG]) ** 2
+
+
+@inline_jit
+def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-untyped-def]
+    """Return HALF_CYCLE if half a cycle is complete, NEW_MOTION if a motion begins, else 0.
+
+    Also tracks the peak command of about the last cycle.
+    """
+    phase_step = phase[i] - phase[i - 1]
+    phase_step -= math.floor(phase_step + 0.5)
+    fading = math.exp(-max(abs(phase_step), 1.0 / limits.rate_hz))
+    scalars[COMMAND_PEAK] = max(abs(command[i]), scalars[COMMAND_PEAK] * fading)
+    if key != scalars[MOTION_KEY]:
+        scalars[MOTION_KEY], scalars[CYCLE_FRACTION] = key, 0.0
+        stage = SWEEP_STAGE if key > 0.0 else 0.5 if key < 0.0 else 0.0
+        scalars[RUN_STAGE] = max(scalars[RUN_STAGE], stage)
+        return NEW_MOTION
+    scalars[CYCLE_FRACTION] += phase_step
+    if scalars[CYCLE_FRACTION] >= 0.5:
+        scalars[CYCLE_FRACTION] -= 0.5
+        return HALF_CYCLE
+    return 0
+
+
+@jit_untyped_kernel
+def check_samples(  # type: ignore[no-untyped-def]
+    values, clipped, command, phase, demanded, keys, index, start, limits, state, findings
+):
+    """Check samples from `start` to the end or the next mark: return (sample, mark, finding count).
+
+    If the mark is not 0, the returned sample is not checked yet; the next call starts there.
+    values (channel, history + sample), command and phase (history + sample,), clipped (channel,
+    sample), demanded acceleration and keys (sample,); `index` is that of the first sample after the
+    history. Rows of `findings`: sample, code, channel, value, limit.
+    """
+    run, scalars = _CheckRun(limits, state, findings, np.zeros(1, np.int64)), state.scalars
+    for k in range(start, keys.size):
+        i, sample = limits.history + k, index + k
+        if sample != scalars[LAST_MARK]:
+            mark = _find_mark(command, phase, i, keys[k], scalars, limits)
+            if mark:
+                scalars[LAST_MARK] = sample
+                return k, mark, run.found[0]
+        repeated = _is_repeated(values, i, limits, scalars)
+        _check_delivery(values, clipped[:, k], i, sample, repeated, run)
+        _check_stuck(values, i, sample, command[i], demanded[k], run)
+        _check_silence(values, i, sample, run)
+        if repeated:
+            repeat_s = scalars[REPEAT_DISTANCE] / limits.rate_hz
+            _report(run, sample, REPEATED, limits.drive_row, repeat_s, 0.0)
+            scalars[COMMAND_ERROR_COUNT] = scalars[FOLLOWING_ERROR_COUNT] = 0.0
+            continue
+        _check_spikes(values, i, sample, run)
+        _check_limits(values, i, sample, run)
+        _check_following(values, command, i, sample, run)
+    return keys.size, 0, run.found[0]
