@@ -83,6 +83,15 @@ def list_duplicates(values: Sequence[SortableT]) -> list[SortableT]:
     return sorted(value for value, count in Counter(values).items() if count > 1)
 
 
+def require_both(key: str, value: object, other: str, info: ValidationInfo) -> None:
+    """Raise InputError if one of two keys is given without the other.
+
+    For a validator of `key`, the later one; an invalid `other` is reported for itself.
+    """
+    if other in info.data and (info.data[other] is None) != (value is None):
+        raise InputError(f"{other} and {key} go together", remedy="give both or neither")
+
+
 def find_attached_text(name: str | None, info: ValidationInfo) -> str | None:
     """Return the text of a file that a key names; None without one, or if `files` is at fault.
 

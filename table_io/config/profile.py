@@ -30,6 +30,7 @@ from table_io.config.base import (
     Positive,
     parse_toml,
     read_text,
+    require_both,
 )
 from table_io.config.excitation import (  # those without a use here register their kinds
     Excitation,
@@ -75,10 +76,7 @@ class Specimen(ConfigModel):
     @field_validator("gap_left_mm")
     @classmethod
     def _check_gap_pair(cls, left: float | None, info: ValidationInfo) -> float | None:
-        if "gap_right_mm" in info.data and (info.data["gap_right_mm"] is None) != (left is None):
-            raise InputError(
-                "gap_right_mm and gap_left_mm go together", remedy="give both or neither"
-            )
+        require_both("gap_left_mm", left, "gap_right_mm", info)
         return left
 
     @property

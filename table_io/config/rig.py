@@ -28,6 +28,7 @@ from table_io.config.base import (
     Number,
     Positive,
     list_duplicates,
+    require_both,
 )
 from table_io.config.channel import ChannelConfig
 from table_io.config.plugins import list_entry_points, load_entry_point
@@ -136,12 +137,7 @@ class MachineLimits(ConfigModel):
     @field_validator("peak_flow_l_min")
     @classmethod
     def _check_flow(cls, flow: float | None, info: ValidationInfo) -> float | None:
-        if "piston_area_cm2" in info.data and (info.data["piston_area_cm2"] is None) != (
-            flow is None
-        ):
-            raise InputError(
-                "piston_area_cm2 and peak_flow_l_min go together", remedy="give both or neither"
-            )
+        require_both("peak_flow_l_min", flow, "piston_area_cm2", info)
         return flow
 
 

@@ -28,7 +28,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
-from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive
+from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive, require_both
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.units import UNITS
@@ -146,8 +146,7 @@ class SensorConfig(ConfigModel):
     @field_validator("shunt_tolerance")
     @classmethod
     def _check_shunt(cls, tolerance: float | None, info: ValidationInfo) -> float | None:
-        if "shunt" in info.data and (info.data["shunt"] is None) != (tolerance is None):
-            raise InputError("shunt and shunt_tolerance go together", remedy="give both or neither")
+        require_both("shunt_tolerance", tolerance, "shunt", info)
         if info.data.get("shunt") == 0.0:
             raise InputError("shunt is 0, which checks nothing", allowed="not 0")
         return tolerance

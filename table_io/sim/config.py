@@ -8,7 +8,7 @@ from typing import Annotated, Literal, NamedTuple
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import ConfigModel, Finite, NonNegative, Positive
+from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, require_both
 from table_io.config.rig import BackendConfig, RigConfig
 from table_io.errors import InputError, suggest
 from table_io.sim.ground_truth import GroundTruth
@@ -261,8 +261,7 @@ class SimulatedTableConfig(BackendConfig):
     @field_validator("truth_sha256")
     @classmethod
     def _check_truth_pair(cls, sha256: str | None, info: ValidationInfo) -> str | None:
-        if "truth" in info.data and (info.data["truth"] is None) != (sha256 is None):
-            raise InputError("truth and truth_sha256 go together", remedy="give both or neither")
+        require_both("truth_sha256", sha256, "truth", info)
         if sha256 is not None and info.data.get("hidden") is not None:
             raise InputError("[simulated.hidden] and truth are given", allowed="one of them")
         return sha256

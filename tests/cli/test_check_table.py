@@ -18,8 +18,8 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from table_io.sim.machine.flight_recorder import read_flight_record
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.flight_records import read_flight_record
 from tests.input_errors import raises_input_error
 from twin.cli.main import app
 from twin.rig.check_table import WiringCheckResult, examine_wiring

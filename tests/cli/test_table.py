@@ -16,7 +16,7 @@ from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sim.machine.flight_recorder import read_flight_record
+from tests.builders.flight_records import read_flight_record
 from tests.input_errors import raises_input_error
 from twin.live.run_command import run_test
 from twin.rig.table import serve_table

@@ -23,8 +23,8 @@ from table_io.backends import HEARTBEAT_TIMEOUT_S
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.sim.machine.flight_recorder import RecordedSession, read_flight_record
 from table_io.units import GRAVITY_M_S2
+from tests.builders.flight_records import RecordedSession, read_flight_record
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 CONTROLLER = str(Path(__file__).with_name("controller.py"))

@@ -35,7 +35,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import RunStart, RunStop, SampleGap
-from table_io.sim.machine.flight_recorder import read_flight_record
+from tests.builders.flight_records import read_flight_record
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Bed
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")

@@ -18,7 +18,8 @@ from nidaqmx.error_codes import DAQmxErrors
 from table_io.backends import MachineLost
 from table_io.backends.ni.config import NiFault
 from table_io.block import Float1D
-from table_io.sim.machine.flight_recorder import FlightRecorder, RecordedSession, read_flight_record
+from table_io.sim.machine.flight_recorder import FlightRecorder
+from tests.builders.flight_records import RecordedSession, read_flight_record
 from tests.table_io.backends.ni_wire import Bed
 
 CALLS: tuple[Any, ...] = ("read", "write", "start", "heartbeat", "output")

@@ -30,7 +30,7 @@ from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import Event
-from table_io.sim.machine.flight_recorder import read_flight_record
+from tests.builders.flight_records import read_flight_record
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     card,

@@ -27,8 +27,9 @@ from table_io.clock import Clock, RealClock
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine import server
-from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
+from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
+from tests.builders.flight_records import read_flight_record
 from tests.table_io.sim.test_machine import RATE_HZ, RIG, SPECIMEN, claim
 
 

@@ -20,9 +20,9 @@ from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sim.machine.flight_recorder import read_flight_record
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
+from tests.builders.flight_records import read_flight_record
 from tests.studies.ni import serve_table
 from tests.studies.ni_error_codes import RATE_HZ, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats

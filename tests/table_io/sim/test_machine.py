@@ -26,8 +26,9 @@ from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
+from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
+from tests.builders.flight_records import read_flight_record
 
 RATE_HZ = 2000.0
 TEXT = (PROFILES_DIR / "rigs" / "machine.toml").read_text()

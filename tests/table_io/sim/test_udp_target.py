@@ -36,9 +36,10 @@ from table_io.backends.udp.packets import (
 from table_io.block import Float1D
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from table_io.sim.machine.flight_recorder import FlightRecorder, read_flight_record
+from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.udp.server import UdpTarget
+from tests.builders.flight_records import read_flight_record
 from tests.table_io.backends.udp_bench import FLAGS, SOURCES, TEXT
 
 RATE_HZ = 2000.0
