@@ -16,7 +16,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from table_io import sequencer
 from table_io.acquisition.drive_follower import (
     REST_INDEX,
     DriveFollower,
@@ -56,6 +55,7 @@ from table_io.excitation.drive import Drive
 from table_io.records import Event, Record, RunStop, Trip
 from table_io.safety import loop_check, protection
 from table_io.safety.protection import Observation
+from table_io.sequencer import procedure
 
 EXTERNAL_STOP_TEXT = "the table cannot be stopped from here: stop it at its controller"
 
@@ -77,7 +77,7 @@ class PassiveProtection:
         self._protection = (
             protection.start_protection(profile, rig, noise) if self.has_command else None
         )
-        self._check_end = sequencer.start_test(sequencer.make_test_plan(profile, rig)).stage.last
+        self._check_end = procedure.start_test(procedure.make_test_plan(profile, rig)).stage.last
         self._check_blocks: list[tuple[Block, int]] = []
         self._check_pending = profile.loop_check.enabled
 
@@ -162,7 +162,7 @@ def plan_open_loop_drive(profile: Profile, rig: RigConfig) -> Drive:
             value=profile.excitation.kind,
             remedy="use a rig that this program drives, with a command queue it can replace",
         )
-    plan = sequencer.make_test_plan(profile, rig)
+    plan = procedure.make_test_plan(profile, rig)
     if make_policy(profile) is not None:
         tables = [name for name in ("dwell", "track", "refine") if getattr(profile, name)]
         raise InputError(
@@ -171,7 +171,7 @@ def plan_open_loop_drive(profile: Profile, rig: RigConfig) -> Drive:
             key=f"[{tables[0]}]",
             remedy="remove this table from the profile",
         )
-    return sequencer.nominal_drive(plan)
+    return procedure.nominal_drive(plan)
 
 
 def record_external(

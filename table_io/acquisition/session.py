@@ -9,7 +9,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from table_io import sequencer
 from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
 from table_io.backends import Backend, MachineLost
 from table_io.block import Block, Bool2D
@@ -24,6 +23,8 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import Event, FrequencyResponse, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.safety import protection
+from table_io.sequencer import procedure
+from table_io.sequencer.state import SequencerState
 
 MAX_LATENESS_S = 0.1  # a block later than this after its schedule is reported
 
@@ -141,8 +142,8 @@ class _Session:
         profile = setup.profile
         self.setup = setup
         self.rate_hz = profile.acquisition.rate_hz
-        plan = sequencer.make_test_plan(profile, setup.rig, backend.replace_after)
-        self._state = sequencer.start_test(plan)
+        plan = procedure.make_test_plan(profile, setup.rig, backend.replace_after)
+        self._state = procedure.start_test(plan)
         block = profile.acquisition.block_samples
         self.output_queue = OutputQueue(backend, clock, setup.rig.output, self._state.drive, block)
         self.verdict, self.reason = "complete", "the whole drive was played"
@@ -221,9 +222,7 @@ class _Session:
         if self.event_log.states[-1] == "armed" and block.step[-1] >= 0:
             self.event_log.enter_state("running")
 
-    def _advance_sequencer(
-        self, block: Block
-    ) -> tuple[sequencer.SequencerState, tuple[Record, ...]]:
+    def _advance_sequencer(self, block: Block) -> tuple[SequencerState, tuple[Record, ...]]:
         """Return the state and records after a block, its changes of the drive being queued.
 
         What a feedback changes is due at once: if the machine played past it meanwhile, the
@@ -231,10 +230,10 @@ class _Session:
         may take longer than a block, are made once.
         """
         queue = self.output_queue
-        decided = sequencer.decide_block(self._state, block)
+        decided = procedure.decide_block(self._state, block)
         for attempt in range(MAX_FEEDBACK_TRIES):
             earliest = queue.first_changeable() + attempt * len(block)
-            state, records = sequencer.answer_block(decided, block, earliest)
+            state, records = procedure.answer_block(decided, block, earliest)
             if state.search is None:
                 if state.drive is not self._state.drive:
                     queue.change_drive(state.drive, state.changed_from)
@@ -256,7 +255,7 @@ class _Session:
             self._state,
             self.output_queue.first_changeable() + round(COMMAND_DELAY_S * self.rate_hz),
         )
-        change = {"hold": sequencer.hold_test, "resume": sequencer.resume_test}[command.name]
+        change = {"hold": procedure.hold_test, "resume": procedure.resume_test}[command.name]
         self._state = change(previous, index)
         if self._state is previous:
             self.event_log.add_event(

@@ -1,10 +1,10 @@
-"""Command buffer of a machine, and the smooth stop that it adds to a command ending in motion."""
+"""Buffers of a machine: its command, with a smooth stop of one in motion, and its samples."""
 
 import math
 
 import numpy as np
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Float2D
 
 MAX_END_ACC_M_S2 = 0.02  # a command is at rest if holding its end needs no more
 GENTLE_ACC_M_S2 = 0.5  # limit of a stop, unless the command before it was rougher
@@ -44,6 +44,56 @@ class CommandBuffer:
         if count > 0:
             self._values = self._values[count:]
             self._origin += count
+
+
+class SampleBuffer:
+    """Samples that were received in order and not yet read; `received` counts all of them."""
+
+    def __init__(self, channels: int) -> None:
+        self.received = 0
+        self._next_read = 0
+        self._channels = channels
+        self._blocks: list[Float2D] = []
+
+    @property
+    def next_read(self) -> int:
+        """Index of the next sample to read."""
+        return self._next_read
+
+    @property
+    def unread(self) -> int:
+        """Number of samples to read."""
+        return self.received - self._next_read
+
+    def put(self, samples: Float2D) -> None:
+        """Add the next samples, (channel, sample)."""
+        self._blocks.append(samples)
+        self.received += samples.shape[1]
+
+    def take(self, count: int) -> Float2D:
+        """Remove and return up to `count` samples, (channel, sample)."""
+        unread = np.concatenate([np.empty((self._channels, 0)), *self._blocks], axis=1)
+        self._blocks = [unread[:, count:]]
+        taken = unread[:, :count]
+        self._next_read += taken.shape[1]
+        return taken
+
+
+def find_newest_sample(received: int, elapsed_s: float, rate_hz: float) -> int:
+    """Return the index of the newest sample taken `elapsed_s` after sample 0, received or not."""
+    return max(received - 1, math.floor(elapsed_s * rate_hz + 1e-6))
+
+
+def refuse_late_command(index: int, earliest: int, replace_after: int, holder: str) -> None:
+    """Raise ValueError if output from sample `index` on, before `earliest`, cannot be replaced.
+
+    The `holder`, such as "device", has it already.
+    """
+    if index < earliest:
+        raise ValueError(
+            f"the command from sample {index} on is already in the {holder}; allowed: from "
+            f"{earliest} on ({replace_after} after the newest sample taken)"
+        )
 
 
 def can_hold(last: Float1D, rate_hz: float) -> bool:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.command_buffer import find_newest_sample, refuse_late_command
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
 from table_io.config.channel import CONSTANT
@@ -280,11 +281,7 @@ class SimulatedBackend:
         """Replace the command from sample `index` on, in V, (sample,); the last value is held."""
         self._require(self._is_open, "open() comes first")
         earliest = 0 if self._epoch is None else self._newest_sample() + self.replace_after
-        if index < earliest:
-            raise ValueError(
-                f"the command from sample {index} on is already in the device; allowed: from "
-                f"{earliest} on ({self.replace_after} after the newest sample taken)"
-            )
+        refuse_late_command(index, earliest, self.replace_after, "device")
         if not np.isfinite(volts).all():
             raise ValueError(
                 f"the command from sample {index} on contains NaN or inf; send finite volts"
@@ -359,7 +356,7 @@ class SimulatedBackend:
     def _newest_sample(self) -> int:
         """Return the index of the newest sample taken so far, read or not."""
         elapsed_s = self._clock.now() - self.scheduled_time_s(0)
-        return max(self._next - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
+        return find_newest_sample(self._next, elapsed_s, self.rate_hz)
 
     def _build_laboratory(self, noise: np.random.Generator, first: int) -> Laboratory:
         """Return the laboratory at rest, its next sample being `first`."""

@@ -25,7 +25,7 @@ from table_io.records import (
     Timing,
     Trip,
 )
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from tests.monitor.monitored import (
     LEVEL,
     PROFILE,

@@ -5,7 +5,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import cycles_to_samples
 from table_io.records import RunStart, Step
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 
 
 class ExpectedEnd:

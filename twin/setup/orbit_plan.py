@@ -19,7 +19,7 @@ from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sequencer import FEEDBACK_HORIZON_S, make_test_plan
+from table_io.sequencer.procedure import FEEDBACK_HORIZON_S, make_test_plan
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.arclength import NoConvergence, correct, weighted_length
 from twin.dynamics.continuation import Branch, continue_branch, make_problem, orbit_weights

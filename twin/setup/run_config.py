@@ -18,7 +18,7 @@ from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import StepDemand, check_limits, compute_demands
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
 from twin.model.parameters import Parameters

@@ -5,7 +5,6 @@ for HEARTBEAT_TIMEOUT_S, it drops the rig and plays the queued command to rest.
 """
 
 import json
-import math
 import select
 import socket
 from typing import NoReturn
@@ -13,6 +12,11 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.command_buffer import (
+    SampleBuffer,
+    find_newest_sample,
+    refuse_late_command,
+)
 from table_io.backends.machine.protocol import (
     REPLACE_AFTER_S,
     MachineConfig,
@@ -75,9 +79,7 @@ class MachineBackend:
         self._socket: socket.socket | None = None
         self._parser = MessageParser()
         self._answers: list[MachineMessage] = []
-        self._unread: list[Float2D] = []  # received and not yet read, (channel, sample)
-        self._received = 0  # samples
-        self._next_read = 0
+        self._samples = SampleBuffer(len(rig.channels))
         self._epoch_s: float | None = None
         self._last_sent_s = 0.0
         self._loss_reason = ""  # why the machine is lost; empty: it is not
@@ -117,12 +119,11 @@ class MachineBackend:
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, volts (sample,); the last value is held."""
-        if self._epoch_s is not None and index < self._newest_sample() + self.replace_after:
-            raise ValueError(
-                f"the command from sample {index} on is already in the machine; allowed: from "
-                f"{self._newest_sample() + self.replace_after} on ({self.replace_after} after the "
-                "newest sample taken)"
-            )
+        if self._epoch_s is not None:
+            elapsed_s = self._clock.now() - self._epoch_s
+            newest = find_newest_sample(self._samples.received, elapsed_s, self.rate_hz)
+            earliest = newest + self.replace_after
+            refuse_late_command(index, earliest, self.replace_after, "machine")
         self._request(values_message(MessageKind.QUEUE, volts, index), MessageKind.QUEUED)
 
     def start(self) -> None:
@@ -133,13 +134,13 @@ class MachineBackend:
 
     def read(self, samples: int) -> Float2D:
         """Wait for the next samples and return their volts, (channel, sample)."""
-        last = self._next_read + samples
+        last = self._samples.next_read + samples
         deadline_s = self.scheduled_time_s(last - 1) + SAMPLE_TIMEOUT_S
         if not self._loss_reason:
             self._require_connection()
         try:
             self._send_heartbeat()
-            while self._received < last:
+            while self._samples.received < last:
                 if not self._receive() and self._clock.now() > deadline_s:
                     self._raise_lost(
                         f"the samples up to {last - 1} have not arrived {SAMPLE_TIMEOUT_S:g} s "
@@ -147,13 +148,10 @@ class MachineBackend:
                     )
                 self._send_heartbeat()
         except MachineLost:
-            if self._received < last:
+            if self._samples.received < last:
                 raise
             # Return the samples that have arrived; the next call raises the loss.
-        unread = np.concatenate([np.empty((len(self.channels), 0)), *self._unread], axis=1)
-        self._unread = [unread[:, samples:]]
-        self._next_read = last
-        return unread[:, :samples]
+        return self._samples.take(samples)
 
     def scheduled_time_s(self, index: int) -> float:
         """Return the time in s, on the session's clock, at which sample `index` is taken."""
@@ -175,11 +173,6 @@ class MachineBackend:
         finally:
             self._socket.close()
             self._socket = None
-
-    def _newest_sample(self) -> int:
-        """Return the index of the newest sample taken by now, read or not."""
-        elapsed_s = self._clock.now() - self.scheduled_time_s(0)
-        return max(self._received - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
 
     def _request(self, request: MachineMessage, kind: MessageKind) -> MachineMessage:
         """Send a request and return its answer; raise ValueError or RuntimeError for a refusal."""
@@ -238,10 +231,9 @@ class MachineBackend:
             self._answers.append(message)
             return
         samples = self._to_matrix(message)
-        if message.index != self._received:
-            self._raise_lost(f"expected sample {self._received}, received {message.index}")
-        self._unread.append(samples)
-        self._received += samples.shape[1]
+        if message.index != self._samples.received:
+            self._raise_lost(f"expected sample {self._samples.received}, received {message.index}")
+        self._samples.put(samples)
 
     def _to_matrix(self, message: MachineMessage) -> Float2D:
         """Return volts, (channel, sample), of a message (sample, channel)."""

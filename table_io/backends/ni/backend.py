@@ -20,7 +20,12 @@ import numpy as np
 from nidaqmx.errors import DaqError, Error
 
 from table_io.backends import HEARTBEAT_TIMEOUT_S, SAMPLE_TIMEOUT_S, MachineLost
-from table_io.backends.command_buffer import CommandBuffer
+from table_io.backends.command_buffer import (
+    CommandBuffer,
+    SampleBuffer,
+    find_newest_sample,
+    refuse_late_command,
+)
 from table_io.backends.ni.driver import (
     REMEDIES,
     ErrorSource,
@@ -144,9 +149,7 @@ class NiBackend:
         self._clock_sync: ClockSync | None = None
         self._commands = CommandBuffer()
         self._written = 0  # samples of output handed to the driver
-        self._unread: list[Float2D] = []  # received and not yet read, (channel, sample)
-        self._received = 0  # samples
-        self._next_read = 0
+        self._samples = SampleBuffer(len(rig.channels))
         self._last_beat_s = 0.0
         self._loss_reason = ""  # why the device is lost; empty: it is not
 
@@ -195,11 +198,7 @@ class NiBackend:
         """Replace the command from sample `index` on, volts (sample,); the last value is held."""
         self._require_tasks()
         earliest = 0 if self._clock_sync is None else self._newest_sample() + self.replace_after
-        if index < earliest:
-            raise ValueError(
-                f"the command from sample {index} on is already in the device; allowed: from "
-                f"{earliest} on ({self.replace_after} after the newest sample taken)"
-            )
+        refuse_late_command(index, earliest, self.replace_after, "device")
         if not volts.size or not np.isfinite(volts).all():
             raise ValueError(
                 f"the command from sample {index} on is empty or contains NaN or inf; send volts"
@@ -217,7 +216,7 @@ class NiBackend:
         first = min(index, self._written)
         self._write_output(first, np.append(self._commands.values(first, index), volts))
         self._commands.replace_from(index, volts)
-        self._commands.discard_before(self._received - 3)
+        self._commands.discard_before(self._samples.received - 3)
 
     def start(self) -> None:
         """Start output and inputs at sample 0: the inputs trigger the armed output."""
@@ -242,17 +241,14 @@ class NiBackend:
 
     def read(self, samples: int) -> Float2D:
         """Wait for the next samples and return their volts, (channel, sample)."""
-        last = self._next_read + samples
+        last = self._samples.next_read + samples
         deadline_s = self.scheduled_time_s(last - 1) + SAMPLE_TIMEOUT_S
         self._require_tasks()
         self._send_heartbeat()
-        while self._received < last:
+        while self._samples.received < last:
             self._receive(last, deadline_s)
             self._send_heartbeat()
-        unread = np.concatenate([np.empty((len(self.channels), 0)), *self._unread], axis=1)
-        self._unread = [unread[:, samples:]]
-        self._next_read = last
-        return unread[:, :samples]
+        return self._samples.take(samples)
 
     def scheduled_time_s(self, index: int) -> float:
         """Return the time in s, on the session's clock, at which sample `index` is taken.
@@ -287,7 +283,7 @@ class NiBackend:
         """Wait for the next samples, at most up to `last`, and send heartbeats meanwhile."""
         assert self._reader is not None
         reader, max_count = self._reader, round(HEARTBEAT_PERIOD_S * self.rate_hz)
-        count = min(last - self._received, max_count)  # with a heartbeat after each
+        count = min(last - self._samples.received, max_count)  # with a heartbeat after each
         reader.request(count)
         while True:
             try:
@@ -303,10 +299,9 @@ class NiBackend:
             if volts is not None:
                 break
             self._send_heartbeat()
-        self._unread.append(volts)
-        self._received += count
+        self._samples.put(volts)
         if self._clock_sync is not None:
-            self._clock_sync.update(self._received - 1, self._clock.now())
+            self._clock_sync.update(self._samples.received - 1, self._clock.now())
 
     def _send_heartbeat(self) -> None:
         """Toggle the heartbeat line and extend the held output, if due."""
@@ -371,7 +366,7 @@ class NiBackend:
     def _newest_sample(self) -> int:
         """Return the index of the newest sample taken by now, read or not."""
         elapsed_s = self._clock.now() - self.scheduled_time_s(0)
-        return max(self._received - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
+        return find_newest_sample(self._samples.received, elapsed_s, self.rate_hz)
 
     def _call_driver(self, source: ErrorSource, call: Callable[[], T]) -> T:
         """Return the result of a driver call; raise its error as MachineLost."""

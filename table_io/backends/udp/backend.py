@@ -11,6 +11,7 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
+from table_io.backends.command_buffer import find_newest_sample, refuse_late_command
 from table_io.backends.udp.link import (
     ANSWER_TIMEOUT_S,
     REASON_TEXTS,
@@ -198,11 +199,7 @@ class UdpBackend:
         """Replace the command from sample `index` on, volts (sample,); the last value is held."""
         self._require_link()
         earliest = self._newest_sample() + self.replace_after if self._started else 0
-        if index < earliest:
-            raise ValueError(
-                f"the command from sample {index} on is already in the target; allowed: from "
-                f"{earliest} on ({self.replace_after} after the newest sample taken)"
-            )
+        refuse_late_command(index, earliest, self.replace_after, "target")
         if not volts.size or not np.isfinite(volts).all():
             raise ValueError(f"the command from sample {index} on is empty or contains NaN or inf")
         if volts.size > RING_SAMPLES:
@@ -356,7 +353,7 @@ class UdpBackend:
     def _newest_sample(self) -> int:
         """Return the index of the newest sample taken by now, read or not."""
         elapsed_s = self._clock.now() - self.scheduled_time_s(0)
-        return max(self._buffer.end - 1, math.floor(elapsed_s * self.rate_hz + 1e-6))
+        return find_newest_sample(self._buffer.end, elapsed_s, self.rate_hz)
 
     def _send_heartbeat(self) -> None:
         link = self._require_link()

@@ -15,7 +15,7 @@ from typing import Protocol
 
 import numpy as np
 
-from table_io.backends.command_buffer import CommandBuffer
+from table_io.backends.command_buffer import CommandBuffer, SampleBuffer
 from table_io.backends.ni.config import NiFault
 from table_io.block import Float1D, Float2D
 
@@ -78,9 +78,7 @@ class Task:
     volts: CommandBuffer = field(default_factory=CommandBuffer)  # output
     written: int = 0  # samples of output; an appended write begins here
     transferred: int = 0
-    unread_blocks: list[Float2D] = field(default_factory=list)  # input not read, (channel, sample)
-    unread: int = 0
-    total: int = 0  # samples of input acquired
+    samples: SampleBuffer = field(default_factory=lambda: SampleBuffer(0))  # input
 
     @property
     def onboard_samples(self) -> int:
@@ -212,7 +210,7 @@ class SimulatedDaqDevice:
             if not task.trigger:
                 self._trigger(task, now_s)
         elif task.kind == "ai":
-            task.unread_blocks, task.unread, task.total = [], 0, 0
+            task.samples = SampleBuffer(len(task.channels))
             task.running, task.since_s = True, now_s
             for other in self.tasks:
                 if other.armed and other.trigger.endswith("/ai/StartTrigger"):
@@ -283,14 +281,11 @@ class SimulatedDaqDevice:
             raise DriverError(task.error)
         if not task.running:
             raise DriverError(ErrorCode.NOT_YET_AVAILABLE)
-        return task.unread >= samples
+        return task.samples.unread >= samples
 
     def read(self, task: Task, samples: int) -> Float2D:
         """Remove and return up to `samples` samples of input, (channel, sample)."""
-        unread = np.concatenate([np.empty((len(task.channels), 0)), *task.unread_blocks], axis=1)
-        task.unread_blocks = [unread[:, samples:]]
-        task.unread = task.unread_blocks[0].shape[1]
-        return unread[:, :samples]
+        return task.samples.take(samples)
 
     def advance(self, now_s: float) -> None:
         """Advance outputs, table and inputs to `now_s`."""
@@ -328,13 +323,14 @@ class SimulatedDaqDevice:
 
     def _acquire(self, task: Task, come: list[Float2D]) -> None:
         """Add input to the buffer of the task; an overflow ends it."""
-        if not self._table.moving and (missing := task.due_samples(self._now_s) - task.total) > 0:
+        if (
+            not self._table.moving
+            and (missing := task.due_samples(self._now_s) - task.samples.received) > 0
+        ):
             come = [*come, self._table.read_at_rest(task.rate_hz, missing)]
         for volts in come:
-            task.unread_blocks.append(volts)
-            task.unread += volts.shape[1]
-            task.total += volts.shape[1]
-        if task.unread > task.buffer:
+            task.samples.put(volts)
+        if task.samples.unread > task.buffer:
             self._fail(task, ErrorCode.NO_LONGER_AVAILABLE)
 
     def _trigger(self, task: Task, now_s: float) -> None:

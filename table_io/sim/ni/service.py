@@ -311,7 +311,7 @@ class NiDeviceService(rpc.NiDAQmxServicer):  # type: ignore[misc]
             """Return (time in s of the last sample, True if all have arrived)."""
             task = self.device.find_task(request.task.id)
             ready = self.device.samples_ready(task, count, now_s)
-            last = task.total - task.unread + count - 1
+            last = task.samples.next_read + count - 1
             return task.since_s + last / max(task.rate_hz, 1.0), ready
 
         def read(now_s: float) -> Float2D:

@@ -20,7 +20,7 @@ from table_io.config.folders import find_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from table_io.sim.opendaq import DrivePlayback
 from tests.builders.drives import sine_segments
 

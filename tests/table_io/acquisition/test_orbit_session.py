@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io import sequencer
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.acquisition.session import OperatorCommand, SessionSetup, run_session
 from table_io.backends import open_backend
@@ -22,7 +21,7 @@ from table_io.config.rig import RigConfig
 from table_io.control.orbit_feedback import advance_feedback
 from table_io.errors import InputError
 from table_io.records import Event, OrbitPoint, Record, RunStart, RunStop
-from table_io.sequencer import orbits, releases
+from table_io.sequencer import orbits, procedure, releases
 from table_io.sim.plant import Plant
 from tests.table_io.sim.plant_orbits import trace_orbits
 
@@ -275,7 +274,7 @@ def list_refusals() -> Iterator[Any]:
 @pytest.mark.parametrize("profile, rig, key", list(list_refusals()))
 def test_refused_before_motion(profile: Profile, rig: RigConfig, key: str) -> None:
     with pytest.raises(InputError) as caught:
-        sequencer.make_test_plan(profile, rig, 40)
+        procedure.make_test_plan(profile, rig, 40)
     assert caught.value.key == key
 
 
@@ -287,7 +286,7 @@ def test_external_controller_cannot_hold_orbits() -> None:
 
 def test_nominal_drive_holds_the_first_orbit() -> None:
     profile = make_profile()
-    drive = sequencer.nominal_drive(sequencer.make_test_plan(profile, RIG, 40))
+    drive = procedure.nominal_drive(procedure.make_test_plan(profile, RIG, 40))
     assert {segment.step for segment in drive.sine_segments} == {-1, 0}
     assert replace(drive.steps[1]) == profile.steps[1]
 

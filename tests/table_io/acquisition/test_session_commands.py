@@ -10,7 +10,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from table_io import sequencer
 from table_io.acquisition.output_queue import DECISION_S, OutputQueue
 from table_io.acquisition.session import (
     COMMAND_DELAY_S,
@@ -28,7 +27,7 @@ from table_io.config.calibration import find_overdue_calibrations
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip
-from table_io.sequencer import actions
+from table_io.sequencer import procedure
 from tests.builders.drives import sine_segments
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
@@ -140,7 +139,7 @@ def test_the_first_end_that_was_ordered_counts(first: str, others: list[str], af
 def test_no_session_ends_before_its_queue_has_run_out(
     ending: str, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(actions, "MAX_HOLD_S", 1.0)
+    monkeypatch.setattr(procedure, "MAX_HOLD_S", 1.0)
     subject = machine()
     if ending == "trip":
         lost = range(after * BLOCK_SAMPLES, after * BLOCK_SAMPLES + 60)
@@ -296,7 +295,7 @@ def test_a_feedback_that_comes_too_late_every_time_ends_the_test(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each try answers from a later sample on, by one block; the last one is the last."""
-    answer, earliest_samples = sequencer.answer_block, []
+    answer, earliest_samples = procedure.answer_block, []
 
     def answer_with_feedback(state: Any, block: Block, earliest: int) -> Any:
         state, records = answer(state, block, earliest)
@@ -305,7 +304,7 @@ def test_a_feedback_that_comes_too_late_every_time_ends_the_test(
         earliest_samples.append(earliest)
         return replace(state, search=object()), records
 
-    monkeypatch.setattr(sequencer, "answer_block", answer_with_feedback)
+    monkeypatch.setattr(procedure, "answer_block", answer_with_feedback)
     monkeypatch.setattr(OutputQueue, "replace_drive", lambda *_: False)
     subject = machine()
     items = list(session(subject, Stop()))
@@ -441,14 +440,14 @@ def test_an_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> N
 def test_a_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    answer = sequencer.answer_block
+    answer = procedure.answer_block
 
     def answer_with_feedback(state: Any, block: Block, earliest: int) -> Any:
         state, records = answer(state, block, earliest)
         is_due = block.end > 100 * BLOCK_SAMPLES
         return (replace(state, search=object()) if is_due else state), records
 
-    monkeypatch.setattr(sequencer, "answer_block", answer_with_feedback)
+    monkeypatch.setattr(procedure, "answer_block", answer_with_feedback)
     monkeypatch.setattr(OutputQueue, "replace_drive", lambda *_: False)
     monkeypatch.setattr(
         OutputQueue,

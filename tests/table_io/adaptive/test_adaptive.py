@@ -21,8 +21,7 @@ from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import HARMONIC_COUNT, NO_FIT, HarmonicFit
 from table_io.errors import InputError
 from table_io.records import Event, Record, Step, StepAdded
-from table_io.sequencer import (
-    SequencerState,
+from table_io.sequencer.procedure import (
     advance_test,
     hold_test,
     make_test_plan,
@@ -30,6 +29,7 @@ from table_io.sequencer import (
     resume_test,
     start_test,
 )
+from table_io.sequencer.state import SequencerState
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segments
 

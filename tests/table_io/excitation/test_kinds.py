@@ -25,7 +25,7 @@ from table_io.errors import InputError
 from table_io.excitation.drive import MAX_STOP_RATIO, Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import compute_demands
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from tests.table_io.excitation.pulse_train import PulseTrain
 
 ORBITS = Path(__file__).parents[1] / "acquisition" / "unstable_orbits.json"

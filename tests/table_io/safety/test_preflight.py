@@ -28,7 +28,7 @@ from table_io.safety.preflight import (
     list_limits,
     list_setup_warnings,
 )
-from table_io.sequencer import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_history_profile, make_profile
 from tests.builders.rigs import RIG, change_rig

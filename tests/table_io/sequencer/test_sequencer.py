@@ -15,8 +15,7 @@ from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Level, Record
-from table_io.sequencer import (
-    SequencerState,
+from table_io.sequencer.procedure import (
     advance_test,
     hold_test,
     make_test_plan,
@@ -24,6 +23,7 @@ from table_io.sequencer import (
     resume_test,
     start_test,
 )
+from table_io.sequencer.state import SequencerState
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
 
