@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from table_io.compilation import inline_jit, jit_untyped_kernel
+from table_io.compilation import jit_untyped_kernel
 from table_io.safety.thresholds import Thresholds
 
 # Codes of findings.
@@ -52,7 +52,7 @@ def make_sample_state(channels: int) -> SampleCheckState:
     return SampleCheckState(np.zeros((CHANNEL_ROWS, channels)), scalars, last_true)
 
 
-class _CheckRun(NamedTuple):
+class CheckRun(NamedTuple):
     """What all checks of a call share; `found[0]` is their number."""
 
     limits: Thresholds
@@ -61,7 +61,7 @@ class _CheckRun(NamedTuple):
     found: Int1D
 
 
-@inline_jit
+@jit_untyped_kernel
 def _median(row, i):  # type: ignore[no-untyped-def]
     """Return the median of the samples i - 2 .. i; NaN if one of them is NaN."""
     a, b, c = row[i - 2], row[i - 1], row[i]
@@ -70,7 +70,7 @@ def _median(row, i):  # type: ignore[no-untyped-def]
     return max(min(a, b), min(max(a, b), c))
 
 
-@inline_jit
+@jit_untyped_kernel
 def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
     """Add a finding, once per episode."""
     last_index, count = run.state.last_true[code, channel], run.found[0]
@@ -83,14 +83,14 @@ def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped
     run.found[0] = count + 1
 
 
-@inline_jit
+@jit_untyped_kernel
 def _report_beyond(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
     """Add a finding if a value exceeds its limit on either side."""
     if abs(value) > limit:
         _report(run, index, code, channel, value, limit)
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_delivery(values, clipped, i, index, repeated, run):  # type: ignore[no-untyped-def]
     """Detect samples at the sensor's range and lost samples; count repeated ones as lost."""
     limits, channels, dropped = run.limits, run.state.channels, True
@@ -113,7 +113,7 @@ def _check_delivery(values, clipped, i, index, repeated, run):  # type: ignore[n
             _report(run, index, BLIND, c, lost_s, limits.max_lost / limits.rate_hz)
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_stuck(values, i, index, command, demanded, run):  # type: ignore[no-untyped-def]
     """Detect stuck channels: runs of equal samples."""
     limits, channels = run.limits, run.state.channels
@@ -133,7 +133,7 @@ def _check_stuck(values, i, index, command, demanded, run):  # type: ignore[no-u
             _report(run, index, STUCK, c, length, min(limits.stuck_run[c], length))
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_silence(values, i, index, run):  # type: ignore[no-untyped-def]
     """Detect channels whose noise, from second differences, fell below that at rest."""
     limits, channels = run.limits, run.state.channels
@@ -159,7 +159,7 @@ def _check_silence(values, i, index, run):  # type: ignore[no-untyped-def]
             _report(run, index, SILENT, c, rms, math.sqrt(least_power / 6.0))
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_spikes(values, i, index, run):  # type: ignore[no-untyped-def]
     """Detect a spike at sample i - 1 in exactly one channel; real motion shows in others too."""
     row, deviation, spike_count = -1, 0.0, 0
@@ -171,7 +171,7 @@ def _check_spikes(values, i, index, run):  # type: ignore[no-untyped-def]
         _report(run, index - 1, SPIKE, row, deviation, run.limits.spike_limit[row])
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_limits(values, i, index, run):  # type: ignore[no-untyped-def]
     """Check stroke, velocity, acceleration and force of the table."""
     limits = run.limits
@@ -191,7 +191,7 @@ def _check_limits(values, i, index, run):  # type: ignore[no-untyped-def]
     _report_beyond(run, index, FORCE, acceleration_row, force, limits.force_n)
 
 
-@inline_jit
+@jit_untyped_kernel
 def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return True if the last samples repeat earlier ones in every noisy channel."""
     for distance in range(max(int(scalars[REPEAT_DISTANCE]), 1), limits.history):
@@ -212,7 +212,7 @@ def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     return False
 
 
-@inline_jit
+@jit_untyped_kernel
 def _check_following(values, command, i, index, run):  # type: ignore[no-untyped-def]
     """Compare the command read back and the position of the table with the queued command."""
     limits, scalars, last_command = run.limits, run.state.scalars, command[i - 1]
@@ -242,7 +242,7 @@ def _check_following(values, command, i, index, run):  # type: ignore[no-untyped
         _report(run, index, FOLLOWING, limits.table_row, error, limit)
 
 
-@inline_jit
+@jit_untyped_kernel
 def _following_error(displacement, command, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the deviation of the table from the position that its command predicts, m.
 
@@ -260,7 +260,7 @@ def _following_error(displacement, command, i, limits, scalars):  # type: ignore
     return abs(displacement - scalars[TABLE_GAIN] * ((1.0 - fraction) * newer + fraction * older))
 
 
-@inline_jit
+@jit_untyped_kernel
 def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the possible table displacement caused by the specimen, m.
 
@@ -277,7 +277,7 @@ def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-
     return ratio * scalars[PAYLOAD_PEAK] * (0.5 * scalars[TABLE_LAG]) ** 2
 
 
-@inline_jit
+@jit_untyped_kernel
 def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-untyped-def]
     """Return HALF_CYCLE if half a cycle is complete, NEW_MOTION if a motion begins, else 0.
 
@@ -310,7 +310,7 @@ def check_samples(  # type: ignore[no-untyped-def]
     sample), demanded acceleration and keys (sample,); `index` is that of the first sample after the
     history. Rows of `findings`: sample, code, channel, value, limit.
     """
-    run, scalars = _CheckRun(limits, state, findings, np.zeros(1, np.int64)), state.scalars
+    run, scalars = CheckRun(limits, state, findings, np.zeros(1, np.int64)), state.scalars
     for k in range(start, keys.size):
         i, sample = limits.history + k, index + k
         if sample != scalars[LAST_MARK]:

@@ -40,6 +40,7 @@ from table_io.safety.sample_checks import (
     TABLE_LAG,
     UNKNOWN_LAG,
     VELOCITY,
+    CheckRun,
     SampleCheckState,
     make_sample_state,
 )
@@ -57,28 +58,35 @@ THRESHOLDS = compute_thresholds(PROFILE, RIG, NOISE_SI)._replace(
 )
 
 
+def start_run(thresholds: Thresholds = THRESHOLDS, room: int = 64) -> CheckRun:
+    """Return a run of the checks without findings, of which there is room for this many."""
+    state = make_sample_state(CHANNEL_COUNT)
+    return CheckRun(thresholds, state, np.full((room, 5), math.nan), np.zeros(1, np.int64))
+
+
 def count_silent(share: float, row: int, thresholds: Thresholds = THRESHOLDS) -> int:
     """Return the findings after the noise of a channel fell to this share of that at rest.
 
     The noise alternates between two values, so that its power is the same at every sample.
     """
-    state = make_sample_state(CHANNEL_COUNT)
+    run = start_run(thresholds)
+    state = run.state
     values = np.ones((CHANNEL_COUNT, 2000))
     values[:, 1::2] = -1.0
     values[row, REST_SAMPLES:] *= share
-    findings, count = np.empty((64, 5)), 0
     for i in range(2, values.shape[1]):
         state.scalars[RUN_STAGE] = 0.0 if i < REST_SAMPLES else SWEEP_STAGE
         if i in (REST_SAMPLES, REST_SAMPLES + 1):
             continue  # the second differences across the change
-        count = sample_checks._check_silence(values, i, i, thresholds, state, findings, count)
+        sample_checks._check_silence(values, i, i, run)
     assert state.channels[REST_COUNT].tolist() == [REST_SAMPLES - 2] * CHANNEL_COUNT
     np.testing.assert_allclose(state.channels[REST_POWER], 16.0 * (REST_SAMPLES - 2))
-    for _, code, channel, value, limit in findings[:count]:
-        assert (int(code), int(channel)) == (SILENT, row)
+    reports = list_reports(run)
+    for _, code, channel, value, limit in reports:
+        assert (code, channel) == (SILENT, row)
         assert value < limit
         assert limit == pytest.approx(math.sqrt(16.0 / 6.0) / 3.0)
-    return count
+    return len(reports)
 
 
 @given(row=st.integers(0, CHANNEL_COUNT - 1), share=st.floats(0.01, 2.0))
@@ -156,25 +164,25 @@ SHARES = st.sampled_from([1.0 - 1e-6, 1.0 + 1e-6])
 Report = tuple[int, int, int, float, float]  # sample, code, channel, value, limit
 
 
-def list_reports(findings: Any, count: int) -> list[Report]:
-    return [(int(a), int(b), int(c), d, e) for a, b, c, d, e in findings[:count].tolist()]
+def list_reports(run: CheckRun) -> list[Report]:
+    found = run.findings[: run.found[0]].tolist()
+    return [(int(a), int(b), int(c), d, e) for a, b, c, d, e in found]
 
 
 @given(gap=st.integers(0, 4000), code=st.integers(0, 12), row=st.integers(0, CHANNEL_COUNT - 1))
 @LAW
 def test_report_repeats_after_a_second(gap: int, code: int, row: int) -> None:
-    state, findings = make_sample_state(CHANNEL_COUNT), np.full((3, 5), math.nan)
-
-    def report(count: int, index: int, code: int, room: int = 3) -> int:
-        arguments = index, code, row, 7.0, 5.0, THRESHOLDS
-        return int(sample_checks._report(state, findings[:room], count, *arguments))
-
-    assert report(0, 0, code) == 1
-    assert report(1, gap, code) == (2 if gap > 2000 else 1)
-    assert report(1, gap, code + 1) == 2  # another finding has its own time
-    assert list_reports(findings, 2) == [(0, code, row, 7.0, 5.0), (gap, code + 1, row, 7.0, 5.0)]
-    assert report(2, gap + 3000, code, 2) == 2  # no room is left
-    assert report(2, gap + 4000, code) == 2  # nor was it absent
+    run = start_run(room=4)
+    first = (0, code, row, 7.0, 5.0)
+    again = [(gap, code, row, 7.0, 5.0)] if gap > 2000 else []
+    other = (gap, code + 1, row, 7.0, 5.0)  # another finding has its own time
+    for index, reported in ((0, code), (gap, code), (gap, code + 1)):
+        sample_checks._report(run, index, reported, row, 7.0, 5.0)
+    assert list_reports(run) == [first, *again, other]
+    full = run._replace(findings=run.findings[: run.found[0]])
+    sample_checks._report(full, gap + 3000, code, row, 7.0, 5.0)  # no room is left
+    sample_checks._report(run, gap + 4000, code, row, 7.0, 5.0)  # nor was it absent
+    assert list_reports(run) == [first, *again, other]
 
 
 @given(
@@ -208,9 +216,9 @@ def test_check_limits_at_each_limit(
         values[ACC] = 0.5 * value / 2000.0
         values[MASS_ACC] = 0.5 * value / 550.0
     values[:, i - 2 : i + 1] += noise - np.median(noise, axis=1, keepdims=True)
-    state, findings = make_sample_state(CHANNEL_COUNT), np.empty((8, 5))
-    count = sample_checks._check_limits(values, i, 77, THRESHOLDS, state, findings, 0)
-    reports = list_reports(findings, count)
+    run = start_run()
+    sample_checks._check_limits(values, i, 77, run)
+    reports = list_reports(run)
     if code == FORCE and is_lost:
         reports = [report for report in reports if report[1] == FORCE]
     expected = [(77, code, TABLE if code in (STROKE, VELOCITY) else ACC)]
@@ -251,8 +259,8 @@ def test_check_following_after_eight_samples(
     if in_check:
         limit_m = 1e-3 * 0.06 + 10 * 5e-6 + 2.5 * peak + 0.02 * 0.06
     for code, row, size in ((COMMAND, DRIVE, command_limit_m), (FOLLOWING, TABLE, limit_m)):
-        state, findings, count = make_sample_state(CHANNEL_COUNT), np.empty((8, 5)), 0
-        scalars = state.scalars
+        run = start_run()
+        scalars = run.state.scalars
         scalars[COMMAND_PEAK], scalars[RUN_STAGE] = peak, stage
         scalars[TABLE_GAIN], scalars[TABLE_LAG] = gain, lag_s
         values = np.zeros((CHANNEL_COUNT, 600))
@@ -264,11 +272,9 @@ def test_check_following_after_eight_samples(
         values[TABLE] = gain * (command - delay * slope)
         values[row] += sign * share * size
         for i in range(500, 510):
-            count = sample_checks._check_following(
-                values, command, i, i, THRESHOLDS, state, findings, count
-            )
+            sample_checks._check_following(values, command, i, i, run)
         expected = sign * share * size
-        reports = list_reports(findings, count)
+        reports = list_reports(run)
         assert [report[:3] for report in reports] == ([(507, code, row)] if share > 1.0 else [])
         for report in reports:
             value = expected if code == COMMAND else abs(expected)
@@ -276,9 +282,7 @@ def test_check_following_after_eight_samples(
             # A sample within the tolerance starts the count again.
             values[row, 510:] -= expected
             for i in range(510, 530):
-                sample_checks._check_following(
-                    values, command, i, i, THRESHOLDS, state, findings, count
-                )
+                sample_checks._check_following(values, command, i, i, run)
             assert scalars[sample_checks.COMMAND_ERROR_COUNT] == 0.0
             assert scalars[sample_checks.FOLLOWING_ERROR_COUNT] == 0.0
 
@@ -332,12 +336,10 @@ def test_check_stuck_after_its_run(row: int, is_noisy: bool, percent: int) -> No
     step = percent * 1e-8
     command = step * np.arange(200.0)
     demanded = 2.0 * command
-    state, findings, count = make_sample_state(CHANNEL_COUNT), np.empty((8, 5)), 0
+    check_run = start_run(thresholds)
     for i in range(2, 200):
-        count = sample_checks._check_stuck(
-            values, i, i, command[i], demanded[i], thresholds, state, findings, count
-        )
-    reports = list_reports(findings, count)
+        sample_checks._check_stuck(values, i, i, command[i], demanded[i], check_run)
+    reports = list_reports(check_run)
     channel = RIG.channels[row]
     run: float = math.inf
     if is_noisy and NOISE_SI[channel][0] > 0:
@@ -361,9 +363,9 @@ def test_check_spikes_in_one_channel(row: int, sign: float, share: float, other:
     if other:
         neighbor = (row + 1) % CHANNEL_COUNT
         values[neighbor, 7] = 2.0 * THRESHOLDS.spike_limit[neighbor]
-    state, findings = make_sample_state(CHANNEL_COUNT), np.empty((8, 5))
-    count = sample_checks._check_spikes(values, 8, 50, THRESHOLDS, state, findings, 0)
-    reports = list_reports(findings, count)
+    run = start_run()
+    sample_checks._check_spikes(values, 8, 50, run)
+    reports = list_reports(run)
     if other and share < 1.0:  # then the neighbor is the only one
         assert [report[:3] for report in reports] == [(49, SPIKE, (row + 1) % CHANNEL_COUNT)]
     elif other or share < 1.0:
@@ -399,23 +401,21 @@ def test_check_delivery_balance_of_lost_samples(row: int, is_repeated: bool) -> 
     lost[600:640] = True
     if not is_repeated:
         values[row, lost] = math.nan
-    state, findings, count = make_sample_state(CHANNEL_COUNT), np.empty((40, 5)), 0
+    run = start_run()
     clipped = np.zeros(CHANNEL_COUNT, dtype=np.bool_)
     balance, level = [], 0.0
     for i in range(2000):
         repeated = bool(is_repeated and lost[i])
-        count = sample_checks._check_delivery(
-            values, clipped, i, i, repeated, THRESHOLDS, state, findings, count
-        )
+        sample_checks._check_delivery(values, clipped, i, i, repeated, run)
         level = max(level + (1.0 if lost[i] else -0.1), 0.0)
-        balance.append(state.channels[sample_checks.LOST_COUNT, row] - level)
+        balance.append(run.state.channels[sample_checks.LOST_COUNT, row] - level)
     assert np.abs(balance).max() < 1e-9
-    reports = [report for report in list_reports(findings, count) if report[1] == BLIND]
+    reports = [report for report in list_reports(run) if report[1] == BLIND]
     blind = range(CHANNEL_COUNT) if is_repeated else [row]
     assert [report[:3] for report in reports] == [(140, BLIND, c) for c in blind]
     for report in reports:
         assert report[3:] == pytest.approx((41 / 2000.0, 0.02))
-    singles = [report for report in list_reports(findings, count) if report[1] == LOST]
+    singles = [report for report in list_reports(run) if report[1] == LOST]
     assert [report[:3] for report in singles] == ([] if is_repeated else [(100, LOST, row)])
 
 
@@ -425,15 +425,13 @@ def test_check_delivery_of_dropped_and_clipped_samples() -> None:
     values[:-1, 9] = math.nan
     clipped = np.zeros((CHANNEL_COUNT, 20), dtype=np.bool_)
     clipped[3, [10, 11, 13, 14, 15]] = clipped[4, [10, 11]] = True
-    state, findings, count = make_sample_state(CHANNEL_COUNT), np.empty((40, 5)), 0
+    run = start_run()
     for i in range(20):
-        count = sample_checks._check_delivery(
-            values, clipped[:, i].copy(), i, i, False, THRESHOLDS, state, findings, count
-        )
-    reports = [report[:3] for report in list_reports(findings, count)]
+        sample_checks._check_delivery(values, clipped[:, i].copy(), i, i, False, run)
+    reports = [report[:3] for report in list_reports(run)]
     lost = [(9, LOST, c) for c in range(CHANNEL_COUNT - 1)]
     assert reports == [(5, DROPPED, DRIVE), *lost, (15, RAIL, 3)]
-    assert list_reports(findings, count)[-1][3:] == (1.0, RIG.sensors[3].range_si)
+    assert list_reports(run)[-1][3:] == (1.0, RIG.sensors[3].range_si)
 
 
 # Thresholds in closed form
