@@ -185,8 +185,6 @@ def _spline_path(command, k, h):  # type: ignore[no-untyped-def]
 @inline_jit
 def _spring_force(u, t, params, hidden):  # type: ignore[no-untyped-def]
     """Return the elastic force of the damper in N; u in m, t in s."""
-    if hidden is None:
-        return params.k * u
     u2 = u * u
     force = (
         u * (params.k * (1.0 + hidden.stiffness_rate * t) + hidden.k5 * u2 * u2) + hidden.ke * u2
@@ -225,8 +223,6 @@ def _damper_force(s, params, hidden):  # type: ignore[no-untyped-def]
 @inline_jit
 def _bumper_coefficients(d, b, softened, j, params, hidden):  # type: ignore[no-untyped-def]
     """Return (static force in N, dashpot in N s/m) of bumper j; d in m, Maxwell force b in N."""
-    if hidden is None:
-        return params.kj * d, params.cj
     static = params.kj * hidden.stiffness_ratio[j] * d + hidden.kc * d * d * d + b
     dashpot = params.cj
     if hidden.k2 != 0.0:
@@ -591,28 +587,9 @@ class Plant:
         )  # fmt: skip
 
     def rest_state(self) -> Float1D:
-        """Return the state of static equilibrium with the table at 0 and all forces relaxed.
-
-        Bisection of spring(u) + N_R - N_L = 0, since the force laws are nonlinear.
-        """
-        params = self._params
-
-        def compress_bumpers(u: float) -> tuple[float, float]:
-            return max(u - self.gap_right_m, 0.0), max(-u - self.gap_left_m, 0.0)
-
-        def force(u: float) -> float:
-            right, left = (
-                _bumper_coefficients.py_func(d, 0.0, 0.0, j, params, self.hidden)[0]
-                for j, d in enumerate(compress_bumpers(u))
-            )
-            return float(_spring_force.py_func(u, 0.0, params, self.hidden) + right - left)
-
-        low, high = -0.05, 0.05
-        for _ in range(80 if force(0.0) != 0.0 else 0):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if force(middle) < 0.0 else (low, middle)
-        u = 0.5 * (low + high)
-        compressions = np.array(compress_bumpers(u))
+        """Return the state of static equilibrium with the table at 0 and all forces relaxed."""
+        u = self._rest_position()
+        compressions = np.array(self._compress_bumpers(u))
         state = np.zeros(self._state_size)
         state[X] = u
         state[D : D + 2] = compressions
@@ -621,6 +598,37 @@ class Plant:
             state[W] = u
             state[T] = -1.0 / self.rate_hz  # sample 0 is then at 0 s
         return state
+
+    def _compress_bumpers(self, u: float) -> tuple[float, float]:
+        return max(u - self.gap_right_m, 0.0), max(-u - self.gap_left_m, 0.0)
+
+    def _rest_position(self) -> float:
+        """Return u in m at which spring(u) + N_R - N_L = 0.
+
+        In closed form without hidden laws; else by bisection, since the laws are nonlinear.
+        """
+        params, hidden = self._params, self.hidden
+        if hidden is None:
+            right, left, u = self.gap_right_m, self.gap_left_m, 0.0
+            for on_r, on_l in ((False, False), (True, False), (False, True), (True, True)):
+                preload_gap = (right if on_r else 0.0) - (left if on_l else 0.0)
+                u = params.kj * preload_gap / (params.k + params.kj * (on_r + on_l))
+                if (u > right) == on_r and (-u > left) == on_l:
+                    break
+            return u
+
+        def force(u: float) -> float:
+            right, left = (
+                _bumper_coefficients.py_func(d, 0.0, 0.0, j, params, hidden)[0]
+                for j, d in enumerate(self._compress_bumpers(u))
+            )
+            return float(_spring_force.py_func(u, 0.0, params, hidden) + right - left)
+
+        low, high = -0.05, 0.05
+        for _ in range(80 if force(0.0) != 0.0 else 0):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if force(middle) < 0.0 else (low, middle)
+        return 0.5 * (low + high)
 
     @property
     def _state_size(self) -> int:
