@@ -14,8 +14,8 @@ from typing import Any
 from pydantic import Field, field_validator
 
 from table_io.config.base import Finite, Number, Positive, list_duplicates, parse_toml, read_text
-from table_io.config.excitation.band_limit import Baseline
 from table_io.config.excitation.record import RecordedHistory, SeriesKeys
+from table_io.config.excitation.waveform import Baseline
 from table_io.config.profile import Profile, attach_files, load_profile
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest

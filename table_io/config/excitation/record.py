@@ -25,12 +25,6 @@ from pydantic import Field, ValidationInfo, field_validator
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Finite, Number, Positive, find_attached_text
 from table_io.config.excitation import History, register_excitation
-from table_io.config.excitation.band_limit import (
-    Baseline,
-    correct_baseline,
-    cut_rest,
-    limit_band,
-)
 from table_io.config.excitation.record_files import (
     Quantity,
     RecordedSeries,
@@ -39,6 +33,7 @@ from table_io.config.excitation.record_files import (
     convert_binary,
     read_series,
 )
+from table_io.config.excitation.waveform import Baseline, correct_baseline, cut_rest, limit_band
 from table_io.errors import InputError, is_control
 from table_io.formats import FORMATS, decode_text
 from table_io.formats.strong_motion import drop_integrals, is_volume_2

@@ -8,8 +8,8 @@ from scipy import signal
 
 from table_io.block import Float1D
 from table_io.config.base import PROFILES_DIR
-from table_io.config.excitation.band_limit import correct_baseline, cut_rest, limit_band
 from table_io.config.excitation.record import RecordedHistory
+from table_io.config.excitation.waveform import correct_baseline, cut_rest, limit_band
 from table_io.config.profile import Profile, load_profile
 from table_io.units import GRAVITY_M_S2
 from tests.input_errors import raises_input_error
