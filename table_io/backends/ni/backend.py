@@ -253,7 +253,7 @@ class NiBackend:
     def scheduled_time_s(self, index: int) -> float:
         """Return the time in s, on the session's clock, at which sample `index` is taken.
 
-        It follows the device's clock, see `clock_sync.py`.
+        It follows the device's clock, see `ClockSync`.
         """
         if self._clock_sync is None:
             raise RuntimeError("NI device: call start() first")

@@ -4,7 +4,7 @@ Its table is read as those of an import (`table_io/formats`). A displacement
 is scaled and resampled to the rate of the rig by band-limited interpolation; its first and last
 samples need not be at rest: quintic blends before and after it, continuous in value and velocity,
 lead from rest and to rest. An acceleration is freed of its baseline, limited to a band and
-integrated twice (`band_limit.py`).
+integrated twice (`waveform.py`).
 
 Similitude: with the ratios l of length and a of acceleration, model over prototype, displacements
 are multiplied by l, accelerations by a and times by sqrt(l / a). Source: Harris and Sabnis,
