@@ -53,12 +53,12 @@ def make_sample_state(channels: int) -> SampleCheckState:
 
 
 class CheckRun(NamedTuple):
-    """What all checks of a call share; `found[0]` is their number."""
+    """What all checks of a call share; `finding_count[0]` is their number."""
 
     limits: Thresholds
     state: SampleCheckState
     findings: Float2D  # rows of sample, code, channel, value, limit
-    found: Int1D
+    finding_count: Int1D
 
 
 @jit_untyped_kernel
@@ -73,14 +73,14 @@ def _median(row, i):  # type: ignore[no-untyped-def]
 @jit_untyped_kernel
 def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
     """Add a finding, once per episode."""
-    last_index, count = run.state.last_true[code, channel], run.found[0]
+    last_index, count = run.state.last_true[code, channel], run.finding_count[0]
     run.state.last_true[code, channel] = index
     if index - last_index <= run.limits.episode_samples or count == run.findings.shape[0]:
         return
     finding = run.findings[count]
     finding[0], finding[1], finding[2] = index, code, channel
     finding[3], finding[4] = value, limit
-    run.found[0] = count + 1
+    run.finding_count[0] = count + 1
 
 
 @jit_untyped_kernel
@@ -317,7 +317,7 @@ def check_samples(  # type: ignore[no-untyped-def]
             mark = _find_mark(command, phase, i, keys[k], scalars, limits)
             if mark:
                 scalars[LAST_MARK] = sample
-                return k, mark, run.found[0]
+                return k, mark, run.finding_count[0]
         repeated = _is_repeated(values, i, limits, scalars)
         _check_delivery(values, clipped[:, k], i, sample, repeated, run)
         _check_stuck(values, i, sample, command[i], demanded[k], run)
@@ -330,4 +330,4 @@ def check_samples(  # type: ignore[no-untyped-def]
         _check_spikes(values, i, sample, run)
         _check_limits(values, i, sample, run)
         _check_following(values, command, i, sample, run)
-    return keys.size, 0, run.found[0]
+    return keys.size, 0, run.finding_count[0]

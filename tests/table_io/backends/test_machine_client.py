@@ -164,7 +164,7 @@ def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data:
 
 def test_what_has_come_is_handed_out_before_the_loss_is_told(machine: Served) -> None:
     backend = driving(machine.where)
-    while backend._received < 200:
+    while backend._samples.received < 200:
         backend._receive()
     backend._require_connection().shutdown(socket.SHUT_RDWR)
     assert np.isfinite(backend.read(100)).all()

@@ -165,8 +165,8 @@ Report = tuple[int, int, int, float, float]  # sample, code, channel, value, lim
 
 
 def list_reports(run: CheckRun) -> list[Report]:
-    found = run.findings[: run.found[0]].tolist()
-    return [(int(a), int(b), int(c), d, e) for a, b, c, d, e in found]
+    rows = run.findings[: run.finding_count[0]].tolist()
+    return [(int(a), int(b), int(c), d, e) for a, b, c, d, e in rows]
 
 
 @given(gap=st.integers(0, 4000), code=st.integers(0, 12), row=st.integers(0, CHANNEL_COUNT - 1))
@@ -179,7 +179,7 @@ def test_report_repeats_after_a_second(gap: int, code: int, row: int) -> None:
     for index, reported in ((0, code), (gap, code), (gap, code + 1)):
         sample_checks._report(run, index, reported, row, 7.0, 5.0)
     assert list_reports(run) == [first, *again, other]
-    full = run._replace(findings=run.findings[: run.found[0]])
+    full = run._replace(findings=run.findings[: run.finding_count[0]])
     sample_checks._report(full, gap + 3000, code, row, 7.0, 5.0)  # no room is left
     sample_checks._report(run, gap + 4000, code, row, 7.0, 5.0)  # nor was it absent
     assert list_reports(run) == [first, *again, other]
