@@ -14,5 +14,6 @@
     `make_rise(...)`.
 `recordings`: fixtures of the session: `bundle` and its `log_file`, `recording` (six steps across
     the down-jump of G4 and back, recorded once).
+`ports`: `free_port()` and `free_endpoint()` of the loopback interface.
 `input_errors.raises_input_error` (next to this package) requires a refusal by its fields.
 """

@@ -3,7 +3,6 @@
 import json
 import os
 import random
-import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -14,6 +13,7 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Event, RunStop
+from tests.builders.ports import free_endpoint
 from twin.live import gateway as gates
 from twin.live.control import send_command
 from twin.live.gateway import (
@@ -82,9 +82,7 @@ def until(true: Callable[[], object]) -> None:
 @pytest.fixture(scope="module")
 def spec() -> Iterator[ProcessConfig]:
     room = make_private_folder(SOCKET_PREFIX)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        listen = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    listen = free_endpoint()
     texts = (BUNDLE.profile_toml, BUNDLE.rig_toml, BUNDLE.model_toml)
     yield ProcessConfig(
         RUN, "quickstart", "", listen, *texts, endpoint=f"{LOCAL_SOCKET_PREFIX}{room / 'bus'}"

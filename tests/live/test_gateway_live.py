@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.ports import free_endpoint
 from tests.live.test_live import (
     QUICK,
     SHAKETWIN,
     assert_whole,
-    endpoint,
     finish,
     kill,
     replay_run,
@@ -24,7 +24,7 @@ LONG = QUICK.replace("cycles = 5", "cycles = 20", 1)
 
 
 def test_dead_gateway_leaves_no_gap_in_any_recording(tmp_path: Path) -> None:
-    listen = endpoint()
+    listen = free_endpoint()
     process = start(tmp_path, "--listen", listen, profile=LONG)
     running(process)
     remote = tmp_path / "there"

@@ -12,8 +12,8 @@ import pytest
 from table_io.block import Block
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Event, RunStop, Timing
+from tests.builders.ports import free_endpoint
 from tests.input_errors import raises_input_error
-from tests.live.test_live import endpoint
 from twin.live import join
 from twin.live.join import join_as_recorder
 from twin.recording.recovery import recover_log
@@ -49,7 +49,7 @@ def gate() -> Iterator[Callable[..., str]]:
     threads = []
 
     def begin(*items: Item, run: str = RUN) -> str:
-        where, ready = endpoint(), threading.Event()
+        where, ready = free_endpoint(), threading.Event()
 
         def serve() -> None:
             link = open_hub(RIG, where, merge_settings(PUBLIC_HUB_SETTINGS, build_open_access(RIG)))

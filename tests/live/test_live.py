@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 
 from table_io.records import Comparison, Fault
+from tests.builders.ports import free_endpoint
 from tests.command_line import call_main
 from twin.recording.reader import Recording, read_recording
 from twin.system.diagnostics import LEVEL_VARIABLE
@@ -38,13 +39,6 @@ QUICK = f"{PROFILE}[loop_check]\nenabled = false\n"  # the processes are the sam
 pytestmark = pytest.mark.usefixtures("drafts")
 
 
-def endpoint() -> str:
-    """A loopback endpoint that nobody uses now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-
-
 def start(folder: Path, *options: str, profile: str = QUICK) -> subprocess.Popen[str]:
     """A live run of the short test that writes to folder/out.
 
@@ -54,7 +48,15 @@ def start(folder: Path, *options: str, profile: str = QUICK) -> subprocess.Popen
     (folder / "twin" / "__init__.py").write_text("raise SystemExit('from the working folder')\n")
     path = folder / "short.toml"
     path.write_text(profile)
-    command = [SHAKETWIN, "run", str(path), "--out", str(folder / "out"), "--listen", endpoint()]
+    command = [
+        SHAKETWIN,
+        "run",
+        str(path),
+        "--out",
+        str(folder / "out"),
+        "--listen",
+        free_endpoint(),
+    ]
     return subprocess.Popen(
         [*command, *options],
         stdout=subprocess.PIPE,
@@ -131,7 +133,7 @@ class WholeRun:
 @pytest.fixture(scope="module")
 def whole_run(tmp_path_factory: pytest.TempPathFactory) -> WholeRun:
     """A run of the short test that logs the lives of its processes; to look at only."""
-    folder, listen = tmp_path_factory.mktemp("whole"), endpoint()
+    folder, listen = tmp_path_factory.mktemp("whole"), free_endpoint()
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(LEVEL_VARIABLE, "info")
         process = start(folder, "--listen", listen, profile=PROFILE)

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import socket
 import threading
 import time
 from collections import Counter
@@ -12,6 +11,7 @@ import pytest
 
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
+from tests.builders.ports import free_endpoint
 from tests.input_errors import raises_input_error
 from twin.live import replay_publishing
 from twin.recording.recovery import recover_log
@@ -27,9 +27,7 @@ PATIENCE_S = 60.0
 def endpoint(monkeypatch: pytest.MonkeyPatch) -> str:
     """A free one; and no report is drawn."""
     monkeypatch.setattr("twin.replay.command.finalize_run", lambda *_: 0)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    return free_endpoint()
 
 
 class Listener(threading.Thread):

@@ -21,8 +21,8 @@ from rich.console import Console
 from rich.text import Text
 
 from table_io.records import RunStop
+from tests.builders.ports import free_endpoint
 from tests.input_errors import raises_input_error
-from tests.live.test_live import endpoint
 from tests.monitor.monitored import RUN, block, point, records, start, stream
 from twin.monitor import app
 from twin.monitor.app import MonitorClient, TerminalDisplay, run_event_loop, run_monitor
@@ -95,7 +95,7 @@ def until(watch: MonitorClient, hub: BusLink, what: Callable[[LiveRunState], obj
 
 
 def test_late_monitor_gets_the_history_then_new_items() -> None:
-    place = endpoint()
+    place = free_endpoint()
     with hub_at(place) as hub:
         publish(hub, [*records(), *stream(6000, 8000)])
         with watching_at(place) as watch:
@@ -112,7 +112,7 @@ def test_late_monitor_gets_the_history_then_new_items() -> None:
 
 
 def test_undecodable_bytes_are_ignored() -> None:
-    place = endpoint()
+    place = free_endpoint()
     with hub_at(place) as hub, watching_at(place) as watch:
         hub.publish("/twin/point", b"\xff\xff garbage")
         publish(hub, [start(), point(1)])
@@ -121,7 +121,7 @@ def test_undecodable_bytes_are_ignored() -> None:
 
 
 def test_lost_rig_is_silent_and_a_new_run_is_shown() -> None:
-    place = endpoint()
+    place = free_endpoint()
     with watching_after(place) as watch:
         watch.listen(0.1)
         assert watch.session_status().silent_s > 0.05
@@ -227,7 +227,7 @@ def test_snapshot_is_printed_or_written_as_svg(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(app, "SNAPSHOT_S", 0.2)
-    place, picture = endpoint(), tmp_path / "now.svg"
+    place, picture = free_endpoint(), tmp_path / "now.svg"
     with running(place):
         run_monitor(place, "simulated", False, True, None, None)
         assert "watched" in capsys.readouterr().out
@@ -244,7 +244,7 @@ def test_snapshot_is_printed_or_written_as_svg(
 def test_monitor_without_rig_or_run_reports_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(app, "ANSWER_TIMEOUT_S", 0.3)
     monkeypatch.setattr(app, "START_TIMEOUT_S", 0.3)
-    place = endpoint()
+    place = free_endpoint()
     with raises_input_error(key="endpoint", value=place, problem="0.3 s"):
         run_monitor(place, "simulated", False, True, None, None)
     with raises_input_error(key="endpoint", value="nonsense"):
@@ -254,7 +254,7 @@ def test_monitor_without_rig_or_run_reports_it(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_output_without_terminal_has_a_line_per_step() -> None:
-    place = endpoint()
+    place = free_endpoint()
     with hub_at(place) as hub:
         publish(hub, [*records(), RunStop(8000, "complete", "all driven")])
         with subprocess.Popen(
@@ -272,7 +272,7 @@ def test_output_without_terminal_has_a_line_per_step() -> None:
 
 
 def test_terminal_is_drawn_and_restored(tmp_path: Path) -> None:
-    place = endpoint()
+    place = free_endpoint()
     here, terminal = pty.openpty()
     fcntl.ioctl(terminal, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
     before = termios.tcgetattr(terminal)

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.ports import free_port
 from tests.live.test_live import QUICK, finish, kill, read_until, start
 from tests.monitor.browser import Browser, open_browser
-from tests.security.laboratory import free_port, laboratory
+from tests.security.laboratory import laboratory
 from twin.cli.credentials import issue_code
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("drafts")]

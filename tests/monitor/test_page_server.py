@@ -18,8 +18,9 @@ from typing import Any
 import pytest
 
 from table_io.clock import local_datetime
+from tests.builders.ports import free_port
 from tests.input_errors import raises_input_error
-from tests.security.laboratory import RIG, RUN, door, free_port, laboratory, own
+from tests.security.laboratory import RIG, RUN, door, laboratory, own
 from twin.cli.credentials import issue_code, remove_person, renew_keys
 from twin.monitor import page_server
 from twin.monitor.page_server import (

@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from tests.builders.ports import free_endpoint, free_port
 from tests.input_errors import raises_input_error
-from tests.live.test_live import endpoint
 from tests.monitor.monitored import point, records
 from tests.monitor.test_app import hub_at, publish
 from tests.monitor.test_page_server import PATIENCE_S, as_person, new_code, read_event
-from tests.security.laboratory import RIG, RUN, door, free_port, laboratory
+from tests.security.laboratory import RIG, RUN, door, laboratory
 from twin.cli.main import app
 from twin.live.run_command import run_test
 from twin.monitor import web
@@ -70,7 +70,7 @@ def wait_for(
 
 
 def test_a_page_waits_for_a_run_and_outlives_its_gateway() -> None:
-    place = endpoint()
+    place = free_endpoint()
     with page_of(place) as events:
         with hub_at(place) as hub:
             publish(hub, records())
@@ -90,7 +90,7 @@ def test_the_page_of_a_run_is_a_process_that_ends_with_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     port = free_port()
-    with start_page_process(f"127.0.0.1:{port}", endpoint(), "simulated", None):
+    with start_page_process(f"127.0.0.1:{port}", free_endpoint(), "simulated", None):
         assert f"page: http://127.0.0.1:{port}/" in capsys.readouterr().out
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
         connection.request("GET", "/")
@@ -104,7 +104,7 @@ def test_foreign_server_is_not_announced_as_the_page(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other, raises_input_error(key="--web"):
         address = f"127.0.0.1:{other.getsockname()[1]}"
-        with start_page_process(address, endpoint(), "simulated", None):
+        with start_page_process(address, free_endpoint(), "simulated", None):
             pass
     assert "page:" not in capsys.readouterr().out
 
@@ -135,7 +135,7 @@ def test_a_page_that_hangs_does_not_keep_the_run(monkeypatch: pytest.MonkeyPatch
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", note_process)
     monkeypatch.setattr(web, "END_TIMEOUT_S", 0.5)
-    with start_page_process(f"127.0.0.1:{free_port()}", endpoint(), "simulated", None):
+    with start_page_process(f"127.0.0.1:{free_port()}", free_endpoint(), "simulated", None):
         processes[0].send_signal(signal.SIGSTOP)
         rescue = threading.Timer(PATIENCE_S, processes[0].kill)
         rescue.start()

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -60,12 +59,6 @@ def write_keys(folder: Path, lab: Path, pair: CertificateKeyPair) -> Path:
     (folder / "key.pem").write_bytes(pair.key)
     (folder / "key.pem").chmod(0o600)
     return folder
-
-
-def free_port() -> int:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
 
 
 def session(endpoint: str, also: ZenohSettings, open_s: float = 2.0) -> Any:

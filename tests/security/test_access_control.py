@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+from tests.builders.ports import free_port
 from tests.input_errors import raises_input_error
 from tests.security.laboratory import (
     COMPONENTS,
@@ -16,7 +17,6 @@ from tests.security.laboratory import (
     alive,
     answers,
     door,
-    free_port,
     laboratory,
     note_keys,
     own,

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 
+from tests.builders.ports import free_port
 from tests.input_errors import raises_input_error
 from tests.security.laboratory import (
     COMPONENTS,
@@ -18,7 +19,6 @@ from tests.security.laboratory import (
     alive,
     answers,
     door,
-    free_port,
     laboratory,
     own,
 )

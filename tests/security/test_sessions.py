@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 from table_io.records import Event
+from tests.builders.ports import free_port
 from tests.live.test_live import SHAKETWIN, running
 from tests.security.laboratory import (
     answers,
     door,
-    free_port,
     laboratory,
     own,
     person,

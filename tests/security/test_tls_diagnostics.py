@@ -14,12 +14,12 @@ import zenoh
 
 from table_io.clock import local_datetime
 from table_io.errors import InputError
+from tests.builders.ports import free_port
 from tests.input_errors import raises_input_error
 from tests.security.laboratory import (
     RIG,
     aged,
     door,
-    free_port,
     laboratory,
     own,
     session,

@@ -1,18 +1,17 @@
 """A Dask cluster whose scheduler and workers are processes that can be killed."""
 
-import socket
 import subprocess
 import sys
 from contextlib import ExitStack
 
 import distributed
 
+from tests.builders.ports import free_port
+
 
 def start_cluster(stack: ExitStack) -> tuple[list[subprocess.Popen[bytes]], str]:
     """Start a scheduler and two workers with nannies; return them and the address."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        address = f"tcp://127.0.0.1:{probe.getsockname()[1]}"
+    address = f"tcp://127.0.0.1:{free_port()}"
     dask = [sys.executable, "-m", "dask"]
     scheduler = [*dask, "scheduler", "--no-dashboard", "--host", address]
     worker = [*dask, "worker", address, "--nthreads", "1", "--no-dashboard"]

@@ -3,7 +3,6 @@
 import os
 import re
 import select
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
+from tests.builders.ports import free_endpoint
 from twin.security.access_control import build_open_access
 from twin.transport import codec
 from twin.transport.endpoint import MEAS_TOPIC, PUBLIC_HUB_SETTINGS, key_expression, merge_settings
@@ -30,9 +30,7 @@ def test_every_topic_and_its_message_stand_in_the_table(topic: str) -> None:
 
 def test_the_example_runs_as_it_stands() -> None:
     (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        endpoint = f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    endpoint = free_endpoint()
     link = open_hub(
         "shaker", endpoint, merge_settings(PUBLIC_HUB_SETTINGS, build_open_access("shaker"))
     )

@@ -5,7 +5,6 @@ import os
 import random
 import select
 import signal
-import socket
 import struct
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.builders.ports import free_endpoint
 from tests.input_errors import raises_input_error
 from twin.transport import reliable_subscriber
 from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC, key_expression
@@ -78,9 +78,7 @@ Start = Callable[..., "subprocess.Popen[str]"]
 
 @pytest.fixture
 def endpoint() -> str:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{free.getsockname()[1]}"
+    return free_endpoint()
 
 
 @pytest.fixture
