@@ -25,6 +25,8 @@ from twin.discovery.identify import identify_parameters
 from twin.discovery.loading import load_logs, load_recordings
 from twin.discovery.parameters import get_log
 from twin.discovery.serialize import model_to_toml, parameter_to_json, verdict_to_json
+from twin.earthquakes.result import DriveResult, TableTwinResult
+from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import find_effect
 from twin.log import Log, open_log
@@ -40,13 +42,19 @@ from twin.studies.maps.results import open_study
 
 __all__ = [
     "DiscoveredModel",
+    "DriveResult",
     "FittedModel",
     "InputError",
     "Interval",
     "Log",
+    "TableDriveOptions",
+    "TableTwinOptions",
+    "TableTwinResult",
     "Verdict",
+    "compute_drive",
     "discover",
     "identify",
+    "identify_table",
     "import_data",
     "open_log",
     "open_study",

@@ -342,7 +342,11 @@ def load_profile(path: Path) -> tuple[Profile, str]:
 
     The text holds all that the test needs, so a recording that keeps it needs no other file.
     """
-    text = read_text(path, "test profile")
+    return parse_profile(read_text(path, "test profile"), path)
+
+
+def parse_profile(text: str, path: Path) -> tuple[Profile, str]:
+    """Parse the text of a test profile, next to whose path its files lie, as `load_profile`."""
     for table in ("excitation", "tracking"):
         text = attach_files(text, path, table)
     return parse_toml(text, Profile, str(path)), text

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.block import Float2D
+from table_io.config.excitation import History
+from table_io.config.excitation.drive_file import DRIVE_KEY, DRIVE_REMEDY
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
@@ -205,6 +207,40 @@ def check_limits(
         )
 
 
+def check_drive_rig(profile: Profile, rig: RigConfig, source: str) -> None:
+    """Raise an InputError if the drive of a history was computed for another rig."""
+    excitation = profile.excitation
+    if not isinstance(excitation, History) or excitation.drive_provenance is None:
+        return
+    rigs = [made_for.name for made_for in excitation.drive_provenance.rigs]
+    if rigs and rig.name not in rigs:
+        raise InputError(
+            f"{excitation.drive} is a drive for rig {rigs[0]!r}, the test is for rig {rig.name!r}; "
+            "nothing was started",
+            where=source,
+            key=DRIVE_KEY,
+            allowed=f"a drive computed with a table twin of {rig.name!r}",
+            remedy=f"run it with the rig file of {rigs[0]!r}, or compute a drive for {rig.name!r}: "
+            "shaketwin table-drive PROFILE --table-twin FILE",
+        )
+
+
+def _list_drive_changes(profile: Profile, rig: RigConfig) -> list[str]:
+    """List how rig and specimen of a test differ from those that its drive was computed for."""
+    excitation = profile.excitation
+    if not isinstance(excitation, History) or excitation.drive is None:
+        return []
+    made_for, drive = excitation.drive_provenance, f"the drive {excitation.drive}"
+    if made_for is None or not made_for.rigs:
+        return [f"{drive} does not say which rig it was computed for; {DRIVE_REMEDY}"]
+    gap_mm = 1e3 * sum(profile.specimen.gaps_m)
+    return [
+        *made_for.list_rig_changes(rig, drive),
+        *made_for.list_mass_changes(profile.specimen.mass_kg, drive),
+        *made_for.list_gap_changes(gap_mm, drive),
+    ]
+
+
 def _find_coarse_outputs(
     rows: tuple[StepDemand, ...], rig: RigConfig, level_key: str
 ) -> list[InputError]:
@@ -376,7 +412,7 @@ def list_drive_warnings(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[st
 
 
 def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
-    """List warnings about implausible values of the specimen, loop check or output buffer."""
+    """List warnings about implausible values of specimen, loop check or buffer, and the drive."""
     messages = []
     mass_ratio = profile.specimen.mass_kg / rig.moving_mass_kg
     if not PAYLOAD_RATIO_RANGE[0] <= mass_ratio <= PAYLOAD_RATIO_RANGE[1]:
@@ -402,6 +438,7 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"{highest_hz:.3g} Hz is extrapolated"
         )
     messages += rig.backend_section.warnings
+    messages += _list_drive_changes(profile, rig)
     block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz
     if block_s > rig.output.lead_s / 4:
         messages.append(

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 from table_io.block import Float1D, Float2D
+from table_io.config.provenance import Provenance
 from table_io.errors import InputError
 from table_io.sim.config import HydraulicTableConfig
 from table_io.sim.hydraulic_table import make_coefficients
@@ -24,7 +25,8 @@ from tests.earthquakes.hydraulic_rig import (
     play,
 )
 from tests.earthquakes.planted_tables import PlantedTable, record_rehearsal
-from twin.earthquakes.drive_computation import compute_drive, measure_error
+from twin.earthquakes.drive_computation import compute_command, measure_error
+from twin.earthquakes.result import TableTwinResult, load_table_twin
 from twin.earthquakes.table_effects import (
     EFFECT_BY_ID,
     LIBRARY,
@@ -34,14 +36,13 @@ from twin.earthquakes.table_effects import (
     describe_size,
     discover_table_effects,
 )
-from twin.earthquakes.table_file import format_table_twin, load_table_twin
 from twin.earthquakes.table_identification import (
     BOUNDS,
     RehearsalProblem,
     TableRehearsal,
     fit_basic_twin,
     fit_table,
-    identify_table,
+    fit_table_twin,
 )
 from twin.earthquakes.table_model import TableModel, TableParameters
 
@@ -306,7 +307,7 @@ def measure_drive_errors(table: PlantedTable, *twins: TableParameters) -> list[f
     for parameters in twins:
         # The instruments of a recording are late by 2 ms, which the twin takes as its own delay.
         model = TableModel(MASS_KG, parameters)
-        command = compute_drive(model, target, RATE_HZ, (0.3, 18.0), reaction).command_m
+        command = compute_command(model, target, RATE_HZ, (0.3, 18.0), reaction).command_m
         achieved = play(rig, command)[0]
         late = min(
             measure_error(np.roll(achieved, shift), target, RATE_HZ, (0.3, 18.0))
@@ -319,9 +320,9 @@ def measure_drive_errors(table: PlantedTable, *twins: TableParameters) -> list[f
 @pytest.mark.slow  # 8 s
 def test_the_file_keeps_the_effect(tmp_path: Path) -> None:
     discovery = rehearse_on_twin("transducer_gain")
-    path = tmp_path / "table.toml"
-    names = [finding.id for finding in discovery.findings]
-    path.write_text(format_table_twin("Table", discovery.fit.to_identification(), names))
+    identification, motion = discovery.fit.to_identification(), discovery.fit.problem.motion
+    result = TableTwinResult("Table", identification, discovery, motion, Provenance())
+    path = result.save(tmp_path / "table.toml")
     config = load_table_twin(path)
     assert config.effects == ("transducer_gain",)
     model = config.build_model()
@@ -394,7 +395,7 @@ def test_the_fit_begins_where_it_can_reach_the_table() -> None:
         },
         delay_ms=3.5,
     )
-    result = identify_table(record_rehearsal(table), TABLE.moving_mass_kg, 42_000.0)
+    result = fit_table_twin(record_rehearsal(table), TABLE.moving_mass_kg, 42_000.0)
     assert result.residual < 0.06
     assert result.model.parameters.friction_n == pytest.approx(1465.0, rel=0.05)
     assert result.model.parameters.oil_hz == pytest.approx(21.34, rel=0.03)

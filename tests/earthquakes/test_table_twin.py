@@ -16,11 +16,11 @@ from tests.earthquakes.hydraulic_rig import (
     make_random_motion,
     play,
 )
-from twin.earthquakes.drive_computation import compute_correction, compute_drive, measure_error
+from twin.earthquakes.drive_computation import compute_command, compute_correction, measure_error
 from twin.earthquakes.table_identification import (
     TableIdentification,
     TableRehearsal,
-    identify_table,
+    fit_table_twin,
 )
 from twin.earthquakes.table_model import TableModel, TableParameters
 
@@ -41,7 +41,7 @@ def rehearse(friction_n: float, noise: bool = True) -> TableRehearsal:
 
 @pytest.fixture(scope="module", params=[500.0, pytest.param(1500.0, marks=pytest.mark.slow)])
 def identification(request: pytest.FixtureRequest) -> tuple[float, TableIdentification]:
-    return request.param, identify_table(rehearse(request.param), MASS_KG, STALL_N)
+    return request.param, fit_table_twin(rehearse(request.param), MASS_KG, STALL_N)
 
 
 @pytest.mark.parametrize("hz", [0.5, 3.0, 9.0, 14.0, 20.0, 28.0, 35.0])
@@ -87,7 +87,7 @@ def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
     linear = compute_correction(target, result.model, RATE_HZ, BAND_HZ)
     by_linear = measure_error(play(rig, linear)[0], target, RATE_HZ, BAND_HZ)
     reaction = -SPECIMEN_KG * play(replace(rig, payload_reaction=False), target)[3]
-    command = compute_drive(result.model, target, RATE_HZ, BAND_HZ, reaction).command_m
+    command = compute_command(result.model, target, RATE_HZ, BAND_HZ, reaction).command_m
     errors = []
     for _ in range(3):
         achieved = play(rig, command)[0]
@@ -100,7 +100,7 @@ def test_the_first_run_of_its_drive_is_right_and_the_next_ones_are_better(
 
 def test_a_drive_rests_at_its_ends(identification: tuple[float, TableIdentification]) -> None:
     target = np.pad(make_random_motion(12.0, (0.5, 10.0), 0.5, seed=2), 1000)
-    command = compute_drive(identification[1].model, target, RATE_HZ, BAND_HZ).command_m
+    command = compute_command(identification[1].model, target, RATE_HZ, BAND_HZ).command_m
     assert command[0] == command[-1] == 0.0
     assert np.abs(np.diff(command)[[0, -1]]).max() < 1e-7
 
@@ -111,4 +111,4 @@ def test_what_is_no_rehearsal_is_refused(seconds: float) -> None:
     zeros = np.zeros(round(seconds * RATE_HZ))
     command = zeros if seconds > 10.0 else np.sin(np.arange(zeros.size) / 100.0)
     with pytest.raises(InputError):
-        identify_table(TableRehearsal(RATE_HZ, command, zeros, zeros, zeros), MASS_KG)
+        fit_table_twin(TableRehearsal(RATE_HZ, command, zeros, zeros, zeros), MASS_KG)

@@ -21,6 +21,7 @@ from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
 from table_io.config.excitation import add_drive_margin
 from table_io.config.excitation.drive_file import format_drive
+from table_io.config.provenance import Provenance
 from table_io.errors import InputError
 from table_io.records import RunStop, Trip
 from table_io.safety.preflight import list_limits
@@ -132,7 +133,9 @@ def write_wrong_drive(path: Path, rng: np.random.Generator) -> None:
     wrong = np.fft.irfft(np.fft.rfft(target) * gain, target.size) * rng.choice([1.0, 1.0, 5.0])
     edge = np.clip(np.arange(target.size) / 500.0, 0.0, 1.0)
     window = np.minimum(edge, edge[::-1])
-    (path.parent / "drive.csv").write_text(format_drive(wrong * window, target, "a wrong drive"))
+    (path.parent / "drive.csv").write_text(
+        format_drive(wrong * window, target, "a wrong drive", Provenance())
+    )
     path.write_text(
         path.read_text().replace("[excitation]\n", '[excitation]\ndrive = "drive.csv"\n')
     )

@@ -1,7 +1,6 @@
 """State of a campaign: campaign.json, replaced atomically at every change, and its recordings."""
 
 import difflib
-import hashlib
 import json
 import re
 from collections.abc import Iterator
@@ -31,7 +30,7 @@ from twin.results.recordings import read_recorded_config
 from twin.results.summary import Json
 from twin.setup.folders import replace_text
 from twin.setup.run_config import RunConfig, make_run_id
-from twin.system.files import lock_file
+from twin.system.files import hash_file, lock_file
 
 CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 CALIBRATION_RECORDS = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
@@ -203,15 +202,6 @@ def _diff_lines(before: str, after: str) -> list[str]:
         if not line.startswith(("---", "+++", "@@"))
     ]
     return [*lines[:8], f"    and {len(lines) - 8} more lines"] if len(lines) > 8 else lines
-
-
-def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file; empty if it cannot be read."""
-    try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return ""
 
 
 @dataclass(slots=True)

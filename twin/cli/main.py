@@ -195,9 +195,10 @@ def table_drive_command(
 ) -> None:
     """Compute the command by which the table follows a record, on the table's twin."""
     from twin.earthquakes.command import compute_drive_command as command
+    from twin.earthquakes.task import TableDriveOptions
 
-    unpaced = speed is Speed.max
-    raise typer.Exit(command(profile, twin, band_hz, out, table, after, iterate, unpaced))
+    options = TableDriveOptions(profile, twin, band_hz, table, after)
+    raise typer.Exit(command(options, out, iterate, speed is Speed.max))
 
 
 @app.command("demo", rich_help_panel=DRIVE_PANEL)

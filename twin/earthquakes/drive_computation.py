@@ -28,20 +28,20 @@ PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its
 
 
 @dataclass(frozen=True, eq=False)
-class ComputedDrive:
+class TwinDrive:
     """Command in m, (sample,), and the twin's expected acceleration error in the band, relative."""
 
     command_m: Float1D
     expected_error: float
 
 
-def compute_drive(
+def compute_command(
     model: TableModel,
     target_m: Float1D,
     rate_hz: float,
     band_hz: tuple[float, float],
     reaction_n: Float1D | None = None,
-) -> ComputedDrive:
+) -> TwinDrive:
     """Compute the command for a target displacement in m, (sample,), at rest at both ends.
 
     `reaction_n`, (sample,), is the force of the specimen on the table during the target motion.
@@ -61,7 +61,7 @@ def compute_drive(
                 break
             best, best_error, lacking = command, error, target_m - achieved
         command = best + step * compute_correction(lacking, model, rate_hz, band_hz)
-    return ComputedDrive(best, best_error)
+    return TwinDrive(best, best_error)
 
 
 def compute_correction(

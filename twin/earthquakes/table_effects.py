@@ -303,7 +303,7 @@ class EffectDiscovery:
     closest: RivalEffect | None
 
 
-def identify_table_and_effects(
+def fit_table_twin_with_effects(
     motion: TableRehearsal,
     mass_kg: float,
     stall_force_n: float = math.inf,

@@ -244,7 +244,7 @@ class TableFit:
         return step
 
 
-def identify_table(
+def fit_table_twin(
     motion: TableRehearsal, mass_kg: float, stall_force_n: float = math.inf
 ) -> TableIdentification:
     """Fit the table's twin to a rehearsal; InputError if that is too short or shows no motion."""

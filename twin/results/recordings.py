@@ -1,12 +1,22 @@
 """Opening of recordings by log or run folder, and their recorded configuration."""
 
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from table_io.config.base import parse_toml
+from table_io.config.excitation import History
+from table_io.config.profile import Profile
+from table_io.config.provenance import HashedFile, Provenance
+from table_io.config.rig import RigConfig
+from table_io.records import RunStart
 from twin.recording.reader import Recording, read_recording
 from twin.recording.run_paths import PARTS_FOLDER, explain_unmerged_parts, resolve_log_path
 from twin.setup.run_config import RunConfig, from_texts, read_model
+from twin.system.files import hash_file
 from twin.system.terminal import error_console
+from twin.system.versions import read_installed_versions
 
 
 def list_parts(log: Path) -> list[Path]:
@@ -47,3 +57,37 @@ def read_recorded_config(recording: Recording, model: str | None = None) -> RunC
     )
     # The steps of an imported recording were detected, not planned by the profile.
     return replace(config, drive=replace(config.drive, steps=start.steps))
+
+
+def build_provenance(recordings: Sequence[Recording]) -> Provenance:
+    """Return the provenance of what is identified from recordings."""
+    starts = [recording.start for recording in recordings]
+    places = [str(recording.path) for recording in recordings]
+    profiles = [
+        parse_toml(start.profile_toml, Profile, place)
+        for start, place in zip(starts, places, strict=True)
+    ]
+    rigs = [
+        HashedFile.of_rig(parse_toml(start.rig_toml, RigConfig, place))
+        for start, place in zip(starts, places, strict=True)
+    ]
+    specimens = [profile.specimen for profile in profiles]
+    levels = map(_find_level, starts, profiles)
+    return Provenance(
+        rigs=tuple(dict.fromkeys(rigs)),
+        masses_kg=tuple(sorted({specimen.mass_kg for specimen in specimens})),
+        gaps_mm=tuple(sorted({1e3 * sum(specimen.gaps_m) for specimen in specimens})),
+        levels_m_s2=tuple(sorted({level for level in levels if math.isfinite(level)})),
+        sources=tuple(
+            HashedFile(name=recording.start.run, sha256=hash_file(recording.path))
+            for recording in recordings
+        ),
+        code=read_installed_versions()["shaketwin"],
+    )
+
+
+def _find_level(start: RunStart, profile: Profile) -> float:
+    """Return the peak table acceleration that a test asks for in m/s2; NaN if it is not known."""
+    if start.steps:
+        return max(step.acceleration_m_s2 for step in start.steps)
+    return profile.plan.level_m_s2 if isinstance(profile.excitation, History) else math.nan

@@ -17,7 +17,7 @@ from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
-from table_io.safety.preflight import StepDemand, check_limits, compute_demands
+from table_io.safety.preflight import StepDemand, check_drive_rig, check_limits, compute_demands
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
@@ -200,6 +200,7 @@ def build_run_config(
         if error.key != "rate_hz":
             raise
         raise error.replace(remedy=f"{error.remedy}, or correct {model_path}") from None
+    check_drive_rig(config.profile, config.rig, source)
     try:
         check_limits(config.margins, config.profile, config.rig, source)
     except InputError as error:

@@ -1,9 +1,10 @@
-"""What differs between operating systems: file locks, number of cores, the browser.
+"""Files and what differs between operating systems: hashes, locks, cores, the browser.
 
 On Windows and macOS recordings are read, replayed, reported, viewed and made by `--speed max`; a
 live run needs Linux.
 """
 
+import hashlib
 import os
 import sys
 import webbrowser
@@ -25,6 +26,15 @@ def lock_file(file: TextIO, exclusive: bool = False) -> None:
     """
     if HAS_FILE_LOCKS:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB if exclusive else fcntl.LOCK_SH)
+
+
+def hash_file(path: Path) -> str:
+    """Return the SHA-256 of a file, hexadecimal; empty if it cannot be read."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError:
+        return ""
 
 
 _locked_folders: dict[Path, int] = {}  # their descriptors, open until this process ends

@@ -18,8 +18,9 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
-from table_io.config.excitation.drive_file import parse_drive
+from table_io.config.excitation.drive_file import parse_drive, parse_drive_provenance
 from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
+from table_io.config.provenance import Provenance
 from table_io.errors import InputError, suggest
 from table_io.records import Step
 
@@ -114,6 +115,13 @@ class History(Excitation):
         It is `displacement`, with the rest around it in which a drive, if there is one, begins.
         """
         return self._add_margin(self._compute_history(rate_hz), rate_hz)
+
+    @property
+    def drive_provenance(self) -> Provenance | None:
+        """What the drive was computed for; None without a drive, or if it does not say."""
+        if self.drive is None:
+            return None
+        return parse_drive_provenance(self.files.get(self.drive, ""), self.drive)
 
     def _compute_history(self, rate_hz: float) -> Float1D:
         return np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)

@@ -2,27 +2,44 @@
 
 Comments after #, a line `drive_mm`, then one value a line at the rate of the run. Two comments
 state the target, so that the drive of one level is not played for another: a specimen with
-clearance does not scale.
+clearance does not scale. The last comments are the drive's provenance in TOML, from its line
+[provenance] on.
 """
 
 import re
 
 import numpy as np
+from pydantic import Field
 
 from table_io.block import Float1D
+from table_io.config.base import ConfigModel, parse_toml
+from table_io.config.provenance import Provenance
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 
-HEADER, KEY = "drive_mm", "excitation.drive"
-REMEDY = "compute it anew with `shaketwin table-drive`"
+HEADER = "drive_mm"
+DRIVE_KEY = "excitation.drive"
+DRIVE_REMEDY = "compute it anew with `shaketwin table-drive`"
 TARGET_PATTERN = re.compile(r"^# target_(peak|rms)_mm = (\S+)$", re.MULTILINE)
 MAX_TARGET_ERROR = 1e-3  # relative, of peak and rms
 MAX_REST_RATIO = 1e-3  # of the peak: largest command at the ends
+PROVENANCE_PATTERN = re.compile(r"^# \[provenance\]\n(#.*\n)*", re.MULTILINE)
 
 
-def format_drive(command_m: Float1D, target_m: Float1D, comment: str) -> str:
+class _DriveHeader(ConfigModel):
+    """TOML in the comments of a drive file."""
+
+    provenance: Provenance = Field(description="What the drive was computed for and from.")
+
+
+def format_drive(
+    command_m: Float1D, target_m: Float1D, comment: str, provenance: Provenance
+) -> str:
     """Return the text of a drive file: command and target in m, (sample,) each."""
-    lines = [f"# {line}" for line in comment.splitlines()]
+    lines = [f"# {' '.join(comment.splitlines())}"]
     lines += [f"# target_{name}_mm = {1e3 * size:.9g}" for name, size in _measure(target_m).items()]
+    header = format_toml({"provenance": provenance.model_dump()})
+    lines += [f"# {line}" for line in header.splitlines() if line]
     return "\n".join([*lines, HEADER, *(f"{1e3 * value:.6f}" for value in command_m), ""])
 
 
@@ -36,21 +53,23 @@ def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
     try:
         command: Float1D = 1e-3 * np.array(lines[1:], dtype=np.float64)
     except ValueError as error:
-        raise InputError(f"{name}: {error}", key=KEY, remedy=REMEDY) from None
+        raise InputError(f"{name}: {error}", key=DRIVE_KEY, remedy=DRIVE_REMEDY) from None
     if lines[:1] != [HEADER] or not command.any() or not np.isfinite(command).all():
         raise InputError(
             f"{name} is no drive",
-            key=KEY,
+            key=DRIVE_KEY,
             allowed=f"a line {HEADER}, then one finite number a line, not all 0",
-            remedy=REMEDY,
+            remedy=DRIVE_REMEDY,
         )
     if max(abs(command[0]), abs(command[-1])) > MAX_REST_RATIO * np.abs(command).max():
-        raise InputError(f"{name} does not begin and end at rest", key=KEY, remedy=REMEDY)
+        raise InputError(
+            f"{name} does not begin and end at rest", key=DRIVE_KEY, remedy=DRIVE_REMEDY
+        )
     if command.size != target_m.size:
         raise InputError(
             f"{name}: {command.size} samples, the target has {target_m.size}",
-            key=KEY,
-            remedy=REMEDY,
+            key=DRIVE_KEY,
+            remedy=DRIVE_REMEDY,
         )
     stated = dict(TARGET_PATTERN.findall(text))
     for quantity, size in _measure(target_m).items():
@@ -62,10 +81,19 @@ def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
             raise InputError(
                 f"{name} is of another target: its {quantity} is "
                 f"{stated.get(quantity, 'unknown')} mm, here {1e3 * size:.6g} mm",
-                key=KEY,
-                remedy=REMEDY,
+                key=DRIVE_KEY,
+                remedy=DRIVE_REMEDY,
             )
     return command
+
+
+def parse_drive_provenance(text: str, name: str) -> Provenance | None:
+    """Return what a drive file was computed for; None if it does not say. InputError if faulty."""
+    header = PROVENANCE_PATTERN.search(text)
+    if header is None:
+        return None
+    toml = "\n".join(line.removeprefix("#") for line in header[0].splitlines())
+    return parse_toml(toml, _DriveHeader, name).provenance
 
 
 def _measure(target_m: Float1D) -> dict[str, float]:

@@ -9,9 +9,9 @@ from PIL import Image
 from scipy import signal
 
 from tests.earthquakes.hydraulic_rig import RATE_HZ, make_random_motion
+from twin.earthquakes.figures import draw_table_twin, estimate_response, plot_steps
 from twin.earthquakes.table_identification import TableRehearsal
 from twin.earthquakes.table_model import TableModel, TableParameters
-from twin.earthquakes.table_twin_figure import draw_table_twin, estimate_response, plot_steps
 
 CORNER_HZ, DELAY = 4.0, 12  # of a first-order table, Hz and samples
 

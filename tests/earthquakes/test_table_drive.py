@@ -1,8 +1,6 @@
 """`table-twin` and `table-drive` as a user runs them on the simulated hydraulic table."""
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,8 +13,8 @@ from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
 from tests.command_line import call_main
-from twin.earthquakes import command as table_drive
-from twin.earthquakes.table_file import load_table_twin
+from twin.earthquakes import task
+from twin.earthquakes.result import load_table_twin
 from twin.earthquakes.table_model import TableParameters
 from twin.recording.reader import read_recording
 from twin.setup.run_config import read_run_config
@@ -118,39 +116,29 @@ def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> Non
     assert call_main("run", profile, "--speed", "max", "--out", run).returncode == 0
     (folder / "record.toml").write_text(RECORD.replace("seed = 3", "seed = 4"))
     with pytest.raises(InputError) as error:
-        compute_after(folder, run)
+        task.compute_drive(
+            task.TableDriveOptions(folder / "record.toml", folder / "table.toml", after=run)
+        )
     assert "another target" in str(error.value)
 
 
-def test_the_search_for_effects_shows_its_stages(
+def test_the_search_for_effects_reports_its_stages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shown: list[str] = []
+    stages: list[str] = []
 
-    @contextmanager
-    def show_status(text: str) -> Iterator[Callable[[str], None]]:
-        yield lambda part: shown.append(f"{text}: {part}")
-
-    def identify(*args: Any, **options: Any) -> None:
-        report = options["report"]
-        report("screening")
+    def identify(*args: Any) -> None:
+        args[-1]("screening")
         raise InputError("enough")
 
     rig_toml = (PROFILES_DIR / "rigs" / "hydraulic.toml").read_text(encoding="utf-8")
     recording = SimpleNamespace(start=SimpleNamespace(rig_toml=rig_toml), run="run")
-    monkeypatch.setattr(table_drive, "show_status", show_status)
-    monkeypatch.setattr(table_drive, "open_recording", lambda path: recording)
-    monkeypatch.setattr(table_drive, "read_table_motion", lambda recording: None)
-    monkeypatch.setattr(table_drive, "identify_table_and_effects", identify)
+    monkeypatch.setattr(task, "open_recording", lambda path: recording)
+    monkeypatch.setattr(task, "read_table_motion", lambda recording: None)
+    monkeypatch.setattr(task, "fit_table_twin_with_effects", identify)
     with pytest.raises(InputError, match="enough"):
-        table_drive.identify_table_command([tmp_path / "run.mcap"], tmp_path / "table.toml")
-    assert shown == ["identifying the table: screening"]
-
-
-def compute_after(folder: Path, run: Path) -> None:
-    table_drive.compute_drive_command(
-        folder / "record.toml", folder / "table.toml", None, folder / "next", None, run, None, True
-    )
+        task.identify_table(task.TableTwinOptions(tmp_path / "run.mcap"), stages.append)
+    assert stages == ["screening"]
 
 
 @pytest.mark.parametrize(

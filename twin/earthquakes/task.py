@@ -1,0 +1,365 @@
+"""Tasks: identify the twin of a table from a rehearsal, and compute a drive on it."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.config.base import parse_toml, read_text
+from table_io.config.excitation import History, add_drive_margin, history_acceleration
+from table_io.config.folders import find_config, list_configs, resolve_config
+from table_io.config.profile import Profile, parse_profile
+from table_io.config.provenance import HashedFile, Provenance
+from table_io.config.rig import RigConfig
+from table_io.config.rig_file import load_rig
+from table_io.errors import InputError
+from twin.earthquakes.drive_computation import PlayedDrive, compute_command, correct_played_drive
+from twin.earthquakes.result import (
+    DRIVE_LINE,
+    DriveResult,
+    TableTwinConfig,
+    TableTwinResult,
+    load_table_twin,
+)
+from twin.earthquakes.table_effects import fit_table_twin_with_effects
+from twin.earthquakes.table_identification import CROSSOVER_HZ, TableRehearsal, fit_table_twin
+from twin.earthquakes.table_model import TableModel
+from twin.recording.reader import Recording
+from twin.results.recordings import build_provenance, open_recording
+from twin.results.tracking import find_band
+from twin.setup.run_config import RunConfig, build_run_config
+from twin.setup.unpaced import generate_ideal_twin
+from twin.system.files import hash_file
+from twin.system.versions import read_installed_versions
+
+CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
+MASS_CHANNEL = "mass_acc_m_s2"
+NOISE_S = 0.4  # at the start, where the table rests
+REST_S = 0.5  # kept before and after the motion
+BLEND_HZ = 0.5  # half width of the change from displacement to acceleration
+Report = Callable[[str], None]  # gets the stage of a task in words
+
+
+@dataclass(frozen=True)
+class TableTwinOptions:
+    """Rehearsal from which the twin of a table is identified, and whether effects are searched."""
+
+    log: Path
+    with_effects: bool = True
+
+
+def identify_table(
+    options: TableTwinOptions, report: Report = lambda stage: None
+) -> TableTwinResult:
+    """Identify the twin of a table from a rehearsal, with the effects that it shows.
+
+    InputError if the recording lacks channels or samples, or is no rehearsal.
+    """
+    recording = open_recording(options.log)
+    rig = parse_toml(recording.start.rig_toml, RigConfig, str(options.log))
+    stall_kn = rig.table_response.stall_force_kn
+    stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
+    rehearsal = read_table_motion(recording)
+    discovery = None
+    if options.with_effects:
+        identification, discovery = fit_table_twin_with_effects(
+            rehearsal, rig.moving_mass_kg, stall_n, report
+        )
+    else:
+        identification = fit_table_twin(rehearsal, rig.moving_mass_kg, stall_n)
+    title = f"{rig.title}, from {recording.run}"
+    provenance = build_provenance([recording])
+    return TableTwinResult(title, identification, discovery, rehearsal, provenance)
+
+
+@dataclass(frozen=True)
+class TableDriveOptions:
+    """Test whose target the table shall follow, and the twin of the table.
+
+    `band_hz` is that of the test unless given, `table` the rig of the twin: a name or the path of a
+    rig file. The drive of the run `after` is corrected by what its table lacked.
+    """
+
+    profile: Path
+    table_twin: Path
+    band_hz: tuple[float, float] | None = None
+    table: str | None = None
+    after: Path | None = None
+
+
+def compute_drive(options: TableDriveOptions, report: Report = lambda stage: None) -> DriveResult:
+    """Compute the command by which a table follows the target of a test, on the table's twin.
+
+    InputError if the test plays no displacement history, the rig is not that of the twin, or the
+    run `after` is that of another target.
+    """
+    return prepare_drive(options, report).compute(options.after, report)
+
+
+@dataclass(frozen=True, eq=False)
+class DriveComputation:
+    """Target of a test, the specimen's force on the table during it, and the table's twin."""
+
+    config: RunConfig
+    profile_path: Path
+    rig: str
+    target_m: Float1D
+    reaction_n: Float1D
+    model: TableModel
+    twin: TableTwinConfig
+    twin_path: Path
+    band_hz: tuple[float, float]
+    notes: tuple[str, ...]
+
+    def compute(
+        self, after: Path | None = None, report: Report = lambda stage: None
+    ) -> DriveResult:
+        """Return the drive by the twin, or that of the run `after`, corrected."""
+        rate_hz = self.config.profile.acquisition.rate_hz
+        sources = [HashedFile(name=self.twin_path.name, sha256=hash_file(self.twin_path))]
+        expected_error = None
+        if after is None:
+            report("computing the drive on the twin of the table")
+            computed = compute_command(
+                self.model, self.target_m, rate_hz, self.band_hz, self.reaction_n
+            )
+            command, expected_error = computed.command_m, computed.expected_error
+        else:
+            recording = open_recording(after)
+            command = self._correct(recording, after)
+            sources.append(HashedFile(name=recording.run, sha256=hash_file(recording.path)))
+        specimen = self.config.profile.specimen
+        provenance = Provenance(
+            rigs=(HashedFile.of_rig(self.config.rig),),
+            masses_kg=(specimen.mass_kg,),
+            gaps_mm=(1e3 * sum(specimen.gaps_m),),
+            levels_m_s2=(float(np.abs(history_acceleration(self.target_m, rate_hz)).max()),),
+            sources=tuple(sources),
+            code=read_installed_versions()["shaketwin"],
+        )
+        return DriveResult(
+            self.config,
+            self.profile_path,
+            self.rig,
+            self.twin.title,
+            command,
+            self.target_m,
+            self.band_hz,
+            expected_error,
+            provenance,
+            self.notes,
+        )
+
+    def _correct(self, recording: Recording, log: Path) -> Float1D:
+        """Return the drive of a recording in m, (sample,), corrected by what its table lacked."""
+        target, run = read_played_drive(recording)
+        if target.size != self.target_m.size or not np.allclose(target, self.target_m, atol=1e-7):
+            raise InputError(
+                "the recording is that of another target",
+                where=log,
+                remedy="give a run of a drive for this profile, at the same level",
+            )
+        rate_hz = self.config.profile.acquisition.rate_hz
+        return correct_played_drive(
+            run, self.model, self.target_m, self.reaction_n, rate_hz, self.band_hz
+        )
+
+
+def prepare_drive(
+    options: TableDriveOptions, report: Report = lambda stage: None
+) -> DriveComputation:
+    """Read the test and the twin of the table, and simulate the specimen on the target."""
+    path = resolve_config(options.profile, "tests")
+    # Without the drive that it may have, which may be of another rig or level.
+    text = DRIVE_LINE.sub("", read_text(path, "test profile"))
+    profile, profile_toml = parse_profile(text, path)
+    excitation, rate_hz = profile.excitation, profile.acquisition.rate_hz
+    if not isinstance(excitation, History):
+        raise InputError(
+            "a drive is computed for a displacement history",
+            where=path,
+            key="excitation.kind",
+            value=excitation.kind,
+            remedy="the level of a stepped sine is tuned while it runs",
+        )
+    twin = load_table_twin(options.table_twin)
+    rig, notes = choose_rig(options, twin, profile, path)
+    config = build_run_config(path.stem, profile, profile_toml, path, str(path), rig)
+    if twin.provenance is not None:
+        notes += twin.provenance.list_rig_changes(config.rig, f"the twin {options.table_twin}")
+    target = add_drive_margin(excitation.displacement(rate_hz), rate_hz)
+    band_hz = options.band_hz or profile.tracking.band_hz
+    if band_hz is None:
+        band_hz = find_band(history_acceleration(target, rate_hz), rate_hz)
+    report("simulating the specimen")
+    reaction = _simulate_reaction(config, target.size)
+    return DriveComputation(
+        config,
+        path,
+        rig,
+        target,
+        reaction,
+        twin.build_model(),
+        twin,
+        options.table_twin,
+        band_hz,
+        tuple(notes),
+    )
+
+
+def choose_rig(
+    options: TableDriveOptions, twin: TableTwinConfig, profile: Profile, path: Path
+) -> tuple[str, list[str]]:
+    """Return (name or path of the rig file of a drive, notes): the rig of the twin.
+
+    InputError if `options.table` is another rig, or the rig of the twin is not found.
+    """
+    asked = options.table or profile.rig
+    if twin.provenance is None or not twin.provenance.rigs:
+        return asked, [
+            f"the twin {options.table_twin} does not say which rig it was identified on, so the "
+            f"drive is taken to be for rig {asked}; identify it again with `shaketwin table-twin`"
+        ]
+    names = [rig.name for rig in twin.provenance.rigs]
+    if options.table is not None:
+        rig = load_rig(find_config(options.table, "rigs", path, option="--table"))[0]
+        if rig.name not in names:
+            raise InputError(
+                f"the twin {options.table_twin} is that of rig {names[0]!r}, not of {rig.name!r}",
+                where=f"--table {options.table}",
+                remedy=f"omit --table, or give the twin of {rig.name!r}, which `shaketwin "
+                "table-twin` identifies from a rehearsal on it",
+            )
+        return options.table, []
+    # The rig of the profile first, then a file of that name, then any other.
+    candidates = list_configs("rigs", path)
+    for name in dict.fromkeys([profile.rig, *names, *candidates]):
+        try:
+            rig_path = find_config(name, "rigs", path)
+            rig = load_rig(rig_path)[0]
+        except InputError:
+            continue  # no rig file, or not of this rig
+        if rig.name in names:
+            notes = []
+            if name != profile.rig:
+                notes.append(
+                    f"the drive is for rig {rig.name}, that of the twin; {path.name} names rig "
+                    f"{profile.rig}"
+                )
+            is_found_anywhere = list_configs("rigs").get(name) == rig_path
+            return name if is_found_anywhere else str(rig_path.resolve()), notes
+    raise InputError(
+        f"no rig file is named {names[0]!r}, the rig of this twin",
+        where=options.table_twin,
+        key="provenance.rigs",
+        allowed=", ".join(candidates),
+        remedy="give its path with --table",
+    )
+
+
+def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
+    """Return the force of the specimen on a table that follows the target, N, (sample,)."""
+    blocks = (item for item in generate_ideal_twin(config) if isinstance(item, Block))
+    predicted = join_blocks([block for block in blocks if block.stream == "pred"])
+    acceleration = predicted.channel("free/mass_acc_m_s2")
+    first = int(np.flatnonzero(predicted.is_history)[0])
+    margin = (count - config.profile.plan.target_m.size) // 2
+    reaction = np.zeros(count)
+    played = -config.profile.specimen.mass_kg * acceleration[first : first + count - margin]
+    reaction[margin : margin + played.size] = played
+    return reaction
+
+
+def read_table_motion(recording: Recording) -> TableRehearsal:
+    """Return command and table of a whole recording, from rest to rest.
+
+    The specimen's force on the table is that of its measured acceleration. InputError if samples
+    or channels are missing.
+    """
+    block = _find_whole_block(recording)
+    profile = _read_profile(recording)
+    moving = np.flatnonzero(block.label != Label.REST)
+    if moving.size == 0:
+        raise InputError("the table does not move in it", where=recording.path)
+    margin = math.ceil(REST_S * block.rate_hz)
+    first = max(int(moving[0]) - margin, 0)
+    last = min(int(moving[-1]) + margin, len(block))
+    block = block.cut(block.index + first, block.index + last)
+    reaction = _measure_reaction(block, profile)
+    command, displacement, acceleration = (block.channel(name) for name in CHANNELS)
+    return TableRehearsal(block.rate_hz, command, displacement, acceleration, reaction)
+
+
+def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
+    """Return the target displacement of a history in m, (sample,), and its run.
+
+    InputError if the recording is not that of a history that was played to its end.
+    """
+    profile = _read_profile(recording)
+    if not isinstance(profile.excitation, History):
+        raise InputError(
+            "the recording is not that of a displacement history", where=recording.path
+        )
+    whole = _find_whole_block(recording)
+    played = np.flatnonzero(whole.is_history)
+    plan, rate_hz = profile.plan, whole.rate_hz
+    if played.size == 0 or int(played[0]) + plan.target_m.size > len(whole):
+        raise InputError("its history was not played to the end", where=recording.path)
+    first = whole.index + int(played[0])
+    block = whole.cut(first, first + plan.target_m.size)
+    displacement, acceleration = (block.channel(name) for name in CHANNELS[1:])
+    resting = whole.cut(whole.index, whole.index + round(NOISE_S * rate_hz))
+    noise_m, noise_m_s2 = (float(resting.channel(name).std()) for name in CHANNELS[1:])
+    return plan.target_m, PlayedDrive(
+        plan.history_m,
+        fuse_displacement(displacement, acceleration, rate_hz),
+        _measure_reaction(block, profile),
+        noise_m,
+        noise_m_s2,
+    )
+
+
+def fuse_displacement(displacement: Float1D, acceleration: Float1D, rate_hz: float) -> Float1D:
+    """Return the displacement in m from a laser below CROSSOVER_HZ, an accelerometer above."""
+    count = displacement.size
+    frequency_hz = np.fft.rfftfreq(count, 1.0 / rate_hz)
+    share = np.clip(0.5 + (frequency_hz - CROSSOVER_HZ) / (2.0 * BLEND_HZ), 0.0, 1.0)
+    square = np.where(frequency_hz > 0.0, (math.tau * frequency_hz) ** 2, 1.0)
+    fast = -np.fft.rfft(acceleration - acceleration.mean()) / square
+    spectrum = (1.0 - share) * np.fft.rfft(displacement) + share * fast
+    fused: Float1D = np.fft.irfft(spectrum, count)
+    return fused
+
+
+def _measure_reaction(block: Block, profile: Profile) -> Float1D:
+    """Return the specimen's force on the table by its acceleration, N, (sample,); 0 without one."""
+    if MASS_CHANNEL not in block.channels:
+        return np.zeros(len(block))
+    reaction: Float1D = -profile.specimen.mass_kg * block.channel(MASS_CHANNEL)
+    return reaction
+
+
+def _read_profile(recording: Recording) -> Profile:
+    return parse_toml(recording.start.profile_toml, Profile, str(recording.path))
+
+
+def _find_whole_block(recording: Recording) -> Block:
+    """Return the measured samples; InputError if some are missing."""
+    blocks = recording.contiguous_blocks("meas")
+    if len(blocks) != 1:
+        raise InputError(
+            f"its measured samples are in {len(blocks)} parts",
+            where=recording.path,
+            remedy="record the motion again without losses",
+        )
+    missing = [name for name in CHANNELS if name not in blocks[0].channels]
+    if missing:
+        raise InputError(f"it has no {', '.join(missing)}", where=recording.path)
+    used = [name for name in (*CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]
+    rows = [blocks[0].channel(name) for name in used]
+    if not all(np.isfinite(row).all() for row in rows):
+        raise InputError("samples were lost in it", where=recording.path)
+    return blocks[0]
