@@ -131,7 +131,7 @@ def mode_solution(
     return (a, w2, y, z, q0, q1, wave, alpha, beta), start
 
 
-@jit_helper()
+@jit_helper(inlined=True)
 def solution_at(t: float, m: ModeSolution) -> Kinematics:
     """Return (u, u', u'', u''') of a mode solution at t s."""
     a, w2, y0, z0, q0, q1, (peak, w, phase), alpha, beta = m
