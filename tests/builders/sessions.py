@@ -17,13 +17,8 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, FrequencyResponse, Record, RunStart, RunStop
-from table_io.safety.protection import (
-    Finding,
-    Observation,
-    inspect_samples,
-    set_response,
-    start_protection,
-)
+from table_io.safety.findings import Finding
+from table_io.safety.protection import Observation, inspect_samples, set_response, start_protection
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.rigs import RIG
 

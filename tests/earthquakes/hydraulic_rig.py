@@ -22,7 +22,7 @@ SPECIMEN_KG = 550.0
 def build_rig(friction_n: float = 500.0, gap_mm: float = math.inf) -> Plant:
     """Return the shipped table with this friction, and a specimen on it."""
     plant = build_plant(TABLE, Specimen(mass_kg=SPECIMEN_KG, gap_mm=gap_mm), RATE_HZ)
-    assert isinstance(plant, Plant)
+    assert plant.oil is not None
     return replace(plant, oil=plant.oil._replace(fc=friction_n, fs=1.3 * friction_n))
 
 

@@ -177,6 +177,8 @@ def test_errors_of_the_set_up_are_those_of_the_plant() -> None:
     by_laboratory = hide_laws(nominal, GroundTruth(imperfections=entries))
     by_effects = hide_laws(nominal, GroundTruth(effects=effects))
     assert by_effects.mass_kg == pytest.approx(by_laboratory.mass_kg)
+    assert by_effects.hidden is not None
+    assert by_laboratory.hidden is not None
     assert by_effects.hidden.tilt == pytest.approx(by_laboratory.hidden.tilt)
     mean = 0.5 * (3e-4 - 1e-4)  # is no asymmetry: a gap is fitted
     assert by_effects.gap_right_m + mean == pytest.approx(by_laboratory.gap_right_m)

@@ -19,8 +19,8 @@ from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget, plan_sweep, start_trajectory
 from table_io.records import Event, FrequencyResponse, Trip
+from table_io.safety.findings import Finding
 from table_io.safety.protection import (
-    Finding,
     Observation,
     ProtectionState,
     inspect_samples,

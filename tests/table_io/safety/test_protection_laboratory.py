@@ -9,7 +9,7 @@ import pytest
 
 from table_io.config.profile import Profile
 from table_io.config.toml_text import format_toml
-from table_io.safety.protection import Finding
+from table_io.safety.findings import Finding
 from table_io.sim.imperfections import draw_laboratory
 from tests.builders.rigs import make_faulty_rig
 from tests.builders.sessions import play_guarded

@@ -27,7 +27,7 @@ MASS_KG = CONFIG.moving_mass_kg
 def build_table(**changes: float) -> Plant:
     """Return the shipped table without payload reaction, some coefficients replaced."""
     plant = build_plant(CONFIG, FREE, RATE_HZ)
-    assert isinstance(plant, Plant)
+    assert plant.oil is not None
     return replace(plant, payload_reaction=False, oil=plant.oil._replace(**changes))
 
 
@@ -90,6 +90,7 @@ def test_agrees_with_an_independent_solution() -> None:
     times = np.arange(400) / RATE_HZ
     command = 2.5e-3 * (1.0 - np.cos(20.0 * times)) ** 2
     signals = play(plant, command)
+    assert plant.oil is not None
     expected = solve_independently(plant.oil, times)
     assert np.abs(expected[0]).max() > 5e-3
     assert np.abs(signals[0] - expected[0]).max() < 1e-6
@@ -128,6 +129,7 @@ def test_the_small_response_is_that_of_the_linear_table(hz: float) -> None:
     position = play(plant, command)[0][-4000:]
     measured = (position * turn).sum() / (command[-4000:] * turn).sum()
     spline = np.sinc(hz / RATE_HZ) ** 3  # of the output stage
+    assert plant.oil is not None
     assert abs(measured / spline / find_linear_response(plant.oil, hz) - 1.0) < 3e-3
 
 
@@ -149,13 +151,15 @@ def test_a_shut_valve_leaves_the_mass_on_the_oil_column() -> None:
 def test_the_table_sticks_below_the_static_friction(share: float, is_stuck: bool) -> None:
     """Under a pressure that the shut valve holds the table rests, or slides on."""
     plant = build_table(gain=0.0, pressure_gain=0.0, feedforward=0.0, leakage=0.0, s1=2e5)
+    assert plant.oil is not None
     # So much oil that its pressure does not fall while the table moves.
-    plant = replace(plant, oil=plant.oil._replace(oil_stiffness=1e6))
+    oil = plant.oil._replace(oil_stiffness=1e6)
+    plant = replace(plant, oil=oil)
     state = plant.rest_state()
-    state[P] = share * plant.oil.fs / plant.oil.area
+    state[P] = share * oil.fs / oil.area
     y = play(plant, np.zeros(2000), state)[0]
     assert (abs(y[-1] - y[-500]) < 1e-6) == is_stuck
-    assert abs(state[BRISTLE]) <= 1.001 * plant.oil.fs / plant.oil.s0
+    assert abs(state[BRISTLE]) <= 1.001 * oil.fs / oil.s0
 
 
 def test_the_open_valve_bounds_the_speed_and_the_supply_the_pressure() -> None:
@@ -166,6 +170,7 @@ def test_the_open_valve_bounds_the_speed_and_the_supply_the_pressure() -> None:
     assert state[SPOOL] == pytest.approx(1.0, abs=1e-3)
     fastest = 63e-3 / 60.0 * math.sqrt(21.0 / 7.0) / 20e-4
     assert speed < 1.3 * fastest  # the oil column swings about it
+    assert plant.oil is not None
     heavy = replace(plant, oil=plant.oil._replace(table_mass=1e5))
     assert np.abs(play(heavy, np.full(150, 10.0))[1]).max() <= 21e6 * 20e-4 / 1e5 * 1.001
 
@@ -205,6 +210,7 @@ def test_no_cut_into_blocks_changes_a_bit() -> None:
 
 def test_less_supply_is_less_force() -> None:
     oil = build_table().oil
+    assert oil is not None
     assert oil.with_supply(0.25).supply == 0.25 * oil.supply
     assert oil.with_supply(0.25).pressure_gain == oil.pressure_gain
 

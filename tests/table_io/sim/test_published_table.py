@@ -31,6 +31,7 @@ def build_published_table() -> Plant:
     """Return the simulated table as the published one: linear, on a frame that does not move."""
     area_m2, supply_pa, open_flow = 1e-3, 1e15, 1.0
     plant = build_rig()
+    assert plant.oil is not None
     oil = plant.oil._replace(
         area=area_m2, table_mass=SPECIMEN_KG, oil_stiffness=A2 / area_m2**2,
         leakage=A3 * area_m2**2 / A2, supply=supply_pa, open_flow=open_flow,
