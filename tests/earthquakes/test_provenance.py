@@ -9,7 +9,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.excitation import History
-from table_io.config.profile import load_profile
+from table_io.config.profile import Specimen, load_profile
 from table_io.config.provenance import HashedFile, Provenance
 from table_io.config.rig import RigConfig
 from table_io.config.toml_text import format_toml
@@ -19,6 +19,7 @@ from tests.command_line import call_main
 from tests.earthquakes.test_table_drive import RECORD, TWIN
 from twin.earthquakes.result import DriveResult, load_table_twin
 from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
+from twin.live.run_command import list_specimen_changes
 from twin.setup.run_config import read_run_config
 from twin.system.files import hash_file
 
@@ -204,3 +205,24 @@ def test_the_command_writes_the_twin_of_the_task(tmp_path: Path) -> None:
     assert (made_for.masses_kg, made_for.gaps_mm) == ((550.0,), (8.0,))
     assert made_for.levels_m_s2[0] == load_profile(test)[0].plan.level_m_s2
     assert made_for.sources[0].sha256 == hash_file(run / "run.mcap")
+
+
+@pytest.mark.parametrize(
+    ("mass_kg", "gap_mm", "words"),
+    [
+        (550.0, math.inf, ""),
+        (552.0, math.inf, ""),
+        (700.0, math.inf, "550 kg, the test has 700 kg (+27.3 %)"),
+        (550.0, 4.0, "without bumpers, the test has some at a total gap of 4 mm"),
+    ],
+)
+def test_a_model_of_another_specimen_is_warned_of(
+    mass_kg: float, gap_mm: float, words: str
+) -> None:
+    """With the specimen that its parameters do not describe; a gap as such is no difference."""
+    provenance = Provenance(masses_kg=(550.0,), gaps_mm=(math.inf,))
+    text = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
+    text += "\n" + format_toml({"provenance": provenance.model_dump()})
+    warnings = list_specimen_changes(text, Specimen(mass_kg=mass_kg, gap_mm=gap_mm))
+    assert len(warnings) == bool(words)
+    assert words in " ".join(warnings)

@@ -16,6 +16,7 @@ from table_io.config.base import (
     read_text,
 )
 from table_io.config.profile import Specimen
+from table_io.config.provenance import Provenance
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.laws.effect import Effect
@@ -112,6 +113,9 @@ class ModelConfig(ConfigModel):
     )
     intervals: dict[str, tuple[Finite, Finite]] = Field(
         default={}, description="95 % intervals of fitted parameters; no calculation uses them."
+    )
+    provenance: Provenance | None = Field(
+        None, description="Specimens and recordings that it was identified from; a run compares."
     )
     base: BaseModelConfig
     effects: tuple[EffectConfig, ...] = ()
