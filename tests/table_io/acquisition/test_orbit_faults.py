@@ -11,11 +11,12 @@ from table_io.acquisition.session import SessionSetup, run_session
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart, RunStop, Trip
 from table_io.safety import loop_check
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.rigs import RIG_TEXT
 from tests.table_io.acquisition.test_orbit_session import RATE_HZ, RIG, Run, make_profile, run
 
 CAPTURE_S, HELD_S = 10.5, 25.0  # of the first orbit; its feedback is large, then small
@@ -32,7 +33,7 @@ TIMES = pytest.mark.parametrize(
 def make_rig(kind: str, at_s: float, **keys: float | str) -> RigConfig:
     """Return the simulated rig with a fault."""
     lines = [f"at_s = {at_s}", *(f"{name} = {value!r}" for name, value in keys.items())]
-    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+    text = RIG_TEXT
     fault = "\n".join([*lines, f'kind = "{kind}"']).replace("'", '"')
     return parse_toml(f"{text}\n[[simulated.faults]]\n{fault}\n", RigConfig, "rig")
 

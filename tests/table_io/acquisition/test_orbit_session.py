@@ -15,7 +15,6 @@ from table_io.acquisition.session import OperatorCommand, SessionSetup, run_sess
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.orbit_feedback import advance_feedback
@@ -23,9 +22,9 @@ from table_io.errors import InputError
 from table_io.records import Event, OrbitPoint, Record, RunStart, RunStop
 from table_io.sequencer import orbits, procedure, releases
 from table_io.sim.plant import Plant
+from tests.builders.rigs import RIG
 from tests.table_io.sim.plant_orbits import trace_orbits
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig file")[0]
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
 RATE_HZ = 2000.0
 MULTIPLIER_PERIODS = 24  # by default

@@ -6,16 +6,15 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_sweep
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer.procedure import make_test_plan, nominal_drive, start_test
 from tests.builders.drives import sine_segment_at, sine_segments
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TEXT = """
 title = "short"
 [specimen]
@@ -48,11 +47,6 @@ def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> N
     assert not drive.command(begins - 2000, 2000).any()  # rest, then a soft start
     first = sine_segment_at(drive, begins)
     assert (first.level0, first.f1) == (0.0, 4.0)
-
-
-def test_its_steps_are_those_of_the_whole_test() -> None:
-    assert nominal_drive(make_test_plan(profile(3), RIG)).steps == profile().sweep.steps
-    assert start_test(make_test_plan(profile(5), RIG)).steps == profile().sweep.steps
 
 
 def test_without_a_loop_check_it_goes_on_at_its_step_too() -> None:

@@ -8,14 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.acquisition.output_queue import OutputQueue
 from table_io.acquisition.session import LatenessLog, OperatorCommand, SessionSetup, run_session
 from table_io.block import Block, Float1D, Float2D, Label, join_blocks
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import command_to_si, si_to_volts
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
@@ -23,12 +20,12 @@ from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
+from tests.builders.rigs import RIG
 
 RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
 TAIL_PEAK = 1.06 * A  # a decay multiplies a motion that may itself be at 1.05
 ALLOWED_DECISION = 0.05  # s from the decision to the first changed sample
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 ROUNDING_M = 1e-15  # of volts and back; a decay differs from the drive by more from its start on
 LEAD = round(RIG.output.lead_s * RATE_HZ)
 
@@ -252,17 +249,6 @@ def test_the_machine_is_used_in_the_order_of_its_contract() -> None:
     assert subject.calls.count("close") == subject.calls.count("start") == 1
 
 
-def test_the_cut_into_blocks_changes_no_sample_of_the_simulated_table() -> None:
-    def whole(block_samples: int) -> Block:
-        table = Watched(profile())
-        return join_blocks(blocks(list(session(table, Stop(), block_samples=block_samples))))
-
-    reference = whole(20)
-    assert np.abs(reference.channel("force_r1_n")).max() > 100.0  # the mass did hit a bumper
-    for samples in (7, 64, 500):
-        assert whole(samples).is_identical(reference)
-
-
 def test_the_tare_is_taken_off_and_told() -> None:
     items = list(session(Watched(profile()), Stop()))
     start = items[0]
@@ -324,39 +310,12 @@ def test_a_stop_is_labelled_from_its_first_sample_to_its_rest() -> None:
     assert not (whole.label[stopping[0] :] == Label.MEASURE).any()
 
 
-def test_a_stop_at_the_very_end_changes_nothing_more() -> None:
-    subject = machine()
-    last = math.ceil(subject.drive.planned_end / 20)
-    items = list(session(subject, Stop(last)))
-    assert stop_record(items).verdict == "stopped"
-    assert subject.changed_samples == []
-
-
-def test_a_stop_brings_the_simulated_table_to_rest() -> None:
-    table = Watched(profile())
-    list(session(table, Stop(300)))
-    assert np.abs(table.table_mm()).max() > 1.0
-    assert np.abs(table.table_mm()[-100:]).max() < 0.03  # noise 0.005 mm rms
-
-
 def test_a_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_can() -> None:
     late = 1500  # 0.75 s, longer than the lead of the card
     subject = machine(replace_after=late)
     list(session(subject, Stop(300)))
     assert subject.changed_samples[0] - (300 * 20 - 1) <= late + 0.01 * RATE_HZ
     assert subject.command[-1] == 0.0
-
-
-def test_what_lies_in_a_slow_device_is_no_part_of_the_lead() -> None:
-    """A device that holds nearly all of a lead: a rig that is a little late is not starved."""
-    late = round(0.48 * RATE_HZ)
-    subject = machine(replace_after=late)
-    player = OutputQueue(subject, subject.clock, RIG.output, subject.drive, 20)
-    player.start()
-    for acquired in range(0, 4000, 20):
-        player.acquired = subject.next = acquired
-        player.feed()
-        assert player._queued_end - acquired >= late + LEAD + 20
 
 
 def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:
@@ -375,63 +334,9 @@ def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:
     assert subject.changed_samples[0] - known <= ALLOWED_DECISION * RATE_HZ
 
 
-@pytest.mark.parametrize(
-    ("channel", "value", "kind"),
-    [("table_acc_m_s2", -15.0, "acceleration"), ("table_disp_m", np.nan, "lost")],
-)
-def test_acceleration_and_a_lost_table_sensor_abort_too(
-    channel: str, value: float, kind: str
-) -> None:
-    faults = {(channel, sample): value for sample in range(5000, 5060)}
-    items = list(session(machine(faults=faults), Stop()))
-    assert stop_record(items).verdict == "aborted"
-    trip = next(item for item in items if isinstance(item, Trip))
-    assert (trip.kind, trip.channel) == (kind, channel)
-
-
 def test_a_trip_wins_over_a_stop_asked_for_in_the_same_block() -> None:
     faults = dict.fromkeys([("table_disp_m", 2000 + k) for k in range(5)], 0.07)
     assert stop_record(list(session(machine(faults=faults), Stop(101)))).verdict == "aborted"
-
-
-def test_a_spike_of_one_sample_is_told_and_stops_nothing() -> None:
-    items = list(session(machine(faults={("table_disp_m", 5007): 0.0655}), Stop()))
-    assert stop_record(items).verdict == "complete"
-    events = [item for item in items if isinstance(item, Event) and item.kind == "sensor"]
-    assert events
-    assert 5007 <= events[0].index <= 5010
-    assert "table_disp_m" in events[0].text
-
-
-def test_lost_samples_stay_lost_and_are_recorded_to_the_sample() -> None:
-    faults = {("mass_disp_m", sample): np.nan for sample in (45, 46, 47, 52, 90)}
-    items = list(session(machine(faults=faults), Stop()))
-    lost = join_blocks(blocks(items)).channel("mass_disp_m")
-    assert np.flatnonzero(np.isnan(lost)).tolist() == [45, 46, 47, 52, 90]
-    assert [item for item in items if isinstance(item, SampleGap)] == [
-        SampleGap(45, 3, "mass_disp_m", "lost"),
-        SampleGap(52, 1, "mass_disp_m", "lost"),
-        SampleGap(90, 1, "mass_disp_m", "lost"),
-    ]
-    assert stop_record(items).verdict == "complete"
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_samples_at_the_range_of_a_sensor_are_recorded_as_clipped(sign: float) -> None:
-    force = RIG.sensors[RIG.channels.index("force_l2_n")].range_si
-    faults = {("force_l2_n", sample): sign * force for sample in range(118, 122)}
-    faults[("force_l2_n", 130)] = sign * 0.99 * force
-    items = list(session(machine(faults=faults), Stop()))
-    gaps = [item for item in items if isinstance(item, SampleGap)]
-    assert gaps == [
-        SampleGap(118, 2, "force_l2_n", "clipped"),
-        SampleGap(120, 2, "force_l2_n", "clipped"),
-    ]
-    # A gap follows the block that it speaks of.
-    place = items.index(gaps[0])
-    before = items[place - 1]
-    assert isinstance(before, Block)
-    assert before.index == 100
 
 
 @pytest.mark.parametrize("items_taken", [1, 2, 40, 80, 300, 500, 900, 1110])
@@ -447,17 +352,6 @@ def test_a_consumer_that_dies_leaves_a_table_at_rest(items_taken: int) -> None:
     if items_taken > 2:
         asked = (items_taken - 1) * 20
         assert subject.moved_until <= asked + ALLOWED_DECISION * RATE_HZ + 1.2 * RATE_HZ
-
-
-def test_a_consumer_that_dies_leaves_the_simulated_table_at_rest() -> None:
-    table = Watched(profile())
-    source = session(table, Stop())
-    for _ in range(300):
-        next(source)
-    source.close()  # type: ignore[attr-defined]
-    assert table.closed
-    assert np.abs(table.table_mm()[:6000]).max() > 1.0
-    assert np.abs(table.table_mm()[-20:]).max() < 0.05
 
 
 def test_an_interrupt_in_the_consumer_brings_the_table_to_rest() -> None:

@@ -180,14 +180,6 @@ def test_an_order_takes_effect_with_its_lead(after: int, wait: int, changes: Cha
     assert stop_record(items).verdict == "complete"
 
 
-def test_a_hold_plays_its_step_until_it_is_resumed() -> None:
-    subject = machine()
-    items = give({300: "hold", 400: "resume"}, subject)
-    whole = join_blocks(blocks(items))
-    assert len(set(whole.step[300 * BLOCK_SAMPLES + 1000 : 400 * BLOCK_SAMPLES].tolist())) == 1
-    assert len(whole) > len(join_blocks(blocks(give({})))) + 500
-
-
 @pytest.mark.parametrize(
     ("orders", "refused"),
     [({1: "hold"}, ["hold in 'armed'"]), ({300: "resume"}, ["resume in 'running'"]),
@@ -273,22 +265,6 @@ def test_late_blocks_are_reported_once_a_series(
     assert [event.index for event in late] == expected
     assert all(f"{event.index} came {late_s:.3f} s late" in event.text for event in late)
     assert stop_record(items).verdict == "complete"
-
-
-@given(
-    first=st.integers(0, 400), lengths=st.lists(st.integers(1, 30), min_size=1, max_size=5),
-    row=st.sampled_from(["mass_disp_m", "force_r1_n"]),
-)  # fmt: skip
-@LAW
-def test_gaps_hold_every_lost_sample_once(first: int, lengths: list[int], row: str) -> None:
-    starts = [first + offset for offset in itertools.accumulate([0, *lengths[:-1]], initial=0)][1:]
-    lost = sorted(
-        {start + k for start, length in zip(starts, lengths, strict=True) for k in range(length)}
-    )[::2]
-    items = give({40: "stop"}, machine(faults={(row, sample): np.nan for sample in lost}))
-    gaps = [item for item in items if isinstance(item, SampleGap)]
-    assert {gap.channel for gap in gaps} == {row}
-    assert [gap.index + k for gap in gaps for k in range(gap.count)] == lost
 
 
 def test_a_feedback_that_comes_too_late_every_time_ends_the_test(

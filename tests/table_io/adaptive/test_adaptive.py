@@ -17,7 +17,6 @@ from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Block, Float1D, Label
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import HARMONIC_COUNT, NO_FIT, HarmonicFit
 from table_io.errors import InputError
 from table_io.records import Event, Record, Step, StepAdded
@@ -25,15 +24,13 @@ from table_io.sequencer.procedure import (
     advance_test,
     hold_test,
     make_test_plan,
-    nominal_drive,
     resume_test,
     start_test,
 )
 from table_io.sequencer.state import SequencerState
 from table_io.units import GRAVITY_M_S2
-from tests.builders.drives import sine_segments
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 A = 0.05 * GRAVITY_M_S2
 NATURAL_HZ, DAMPING = (
     1.2876,
@@ -573,13 +570,6 @@ def dwelling(**control: Any) -> Profile:
     return test.model_copy(update={"control": test.control.model_copy(update=control)})
 
 
-@pytest.mark.parametrize("samples", [7, 500])
-def test_the_cut_of_the_samples_changes_no_decision(samples: int) -> None:
-    whole, cut = (Table(start_test(make_test_plan(dwelling(), RIG, 40))) for _ in range(2))
-    assert whole.play(20) == cut.play(samples)
-    assert whole.state.drive == cut.state.drive
-
-
 @pytest.mark.parametrize("control", [True, False])
 def test_a_decided_step_is_announced_before_it_begins(control: bool) -> None:
     table = Table(start_test(make_test_plan(dwelling(enabled=control), RIG, 40)))
@@ -603,14 +593,6 @@ def test_a_decided_step_is_announced_before_it_begins(control: bool) -> None:
     command: Float1D = drive.command(0, drive.rest_start + 10)
     assert np.abs(np.diff(command, 2)).max() * drive.rate_hz**2 <= 1.05 * A
     assert not command[drive.rest_start :].any()
-
-
-def test_a_rehearsal_plays_the_sweep_and_ends() -> None:
-    plan = make_test_plan(dwelling(), RIG, 40)
-    drive = nominal_drive(plan)
-    assert drive.steps == plan.profile.sweep.steps
-    assert {segment.step for segment in sine_segments(drive)} == {0, 1}
-    assert len([segment for segment in sine_segments(drive) if segment.cycles]) == 2
 
 
 @pytest.mark.parametrize("after", [0, 2000])

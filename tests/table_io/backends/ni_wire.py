@@ -11,16 +11,16 @@ from nidaqmx._stubs import nidaqmx_pb2 as pb
 from table_io.backends.ni.backend import NiBackend
 from table_io.backends.ni.config import NiWiring
 from table_io.clock import Clock, ManualClock
-from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.profile import Specimen
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.server import InterlockedTable
 from table_io.sim.ni.service import NiDeviceService
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import read_rig_text
 
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
-CARD = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text()
+CARD = read_rig_text("ni_simulated")
 
 
 def get_wiring(rig: RigConfig) -> NiWiring:

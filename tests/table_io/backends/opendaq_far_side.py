@@ -14,14 +14,13 @@ import numpy as np
 from table_io.block import Float2D
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
-from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.machine.table import MachineSession
 from table_io.sim.opendaq import NS_PER_S, TICK_S, OpenDaqServer
+from tests.builders.profiles import SPECIMEN
 
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
 
 

@@ -21,6 +21,7 @@ from table_io.config.rig import BACKEND_GROUP, RigConfig, load_backend
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SIMULATOR_GROUP, find_simulator
+from tests.builders.rigs import read_rig_text
 from tests.command_line import call_main
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -29,7 +30,7 @@ PAGE = (ROOT / "table_io" / "CONNECT.md").read_text(encoding="utf-8").partition(
 MODULE, PROJECT = (
     re.findall(rf"```{language}\n(.*?)```", PAGE, re.DOTALL)[0] for language in ("python", "toml")
 )
-UDP_RIG = (PROFILES_DIR / "rigs" / "udp_example.toml").read_text(encoding="utf-8")
+UDP_RIG = read_rig_text("udp_example")
 RIG = re.sub(r"\[udp\].*?(?=\[limits\])", "[ideal]\ngain = 1.0\n\n", UDP_RIG, flags=re.DOTALL)
 RIG = RIG.replace('"udp"', '"ideal"').replace("udp_example", "ideal")
 PROFILE = """

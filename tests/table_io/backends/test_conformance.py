@@ -16,9 +16,9 @@ from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.profiles import SPECIMEN
 from tests.table_io.backends.conformance import CLAUSES, LOST, RATE_HZ, Bench
 
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 LOSS = f"""
 [[simulated.faults]]
 kind = "dropped"

@@ -16,7 +16,7 @@ from table_io.backends.ni.backend import ClockSync, NiBackend
 from table_io.backends.ni.config import NiFault
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock, RealClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
@@ -24,6 +24,7 @@ from table_io.records import RunStart, RunStop, SampleGap, Trip
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
+from tests.builders.rigs import RIG_TEXT
 from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
 
@@ -401,9 +402,7 @@ def test_no_sample_is_scheduled_after_it_has_come() -> None:
 
 def test_the_shipped_card_is_the_simulated_table() -> None:
     ours = parse_toml(CARD, RigConfig, "card").model_dump()
-    theirs = parse_toml(
-        (PROFILES_DIR / "rigs" / "simulated.toml").read_text(), RigConfig, "card"
-    ).model_dump()
+    theirs = parse_toml(RIG_TEXT, RigConfig, "card").model_dump()
     assert ours.pop("ni")
     for key in ("name", "title", "backend"):
         ours.pop(key), theirs.pop(key)

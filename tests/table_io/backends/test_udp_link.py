@@ -40,7 +40,6 @@ from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.udp.server import UdpTarget, bind_socket, serve_udp_target
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
-    TEXT,
     Address,
     Relay,
     card,
@@ -101,14 +100,6 @@ def driving(address: Address, samples: int = 600) -> UdpBackend:
     backend.start()
     backend.read(20)
     return backend
-
-
-def test_the_shipped_card_is_the_simulated_one_behind_a_target() -> None:
-    own = {"name", "title", "backend", "udp"}
-    simulated = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
-    rig = parse_toml(TEXT, RigConfig, "udp_simulated")
-    assert rig.model_dump(exclude=own) == simulated.model_dump(exclude=own)
-    assert rig.name == "udp_simulated"
 
 
 def test_nobody_there_says_what_to_look_at() -> None:

@@ -17,14 +17,14 @@ import pytest
 from table_io.backends import udp
 from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import Clock
-from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.profile import Specimen
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import read_rig_text
 from tests.table_io.backends.conformance import LOST, RATE_HZ, Bench
 
 Address = tuple[str, int]
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
-TEXT = (PROFILES_DIR / "rigs" / "udp_simulated.toml").read_text()
+TEXT = read_rig_text("udp_simulated")
 SHIPPED = "127.0.0.1:7460"
 LOSS = f"""
 [[simulated.faults]]

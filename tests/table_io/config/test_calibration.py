@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import (
     command_to_si,
     command_to_volts,
@@ -16,10 +15,10 @@ from table_io.config.calibration import (
     si_to_volts,
     volts_to_si,
 )
-from table_io.config.rig import OutputConfig, RigConfig
+from table_io.config.rig import OutputConfig
 from table_io.config.sensor import SensorConfig
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 REVERSED = SensorConfig(channel="force_l1_n", unit="kN", range=10.0, volts_per_unit=-0.5, bits=16)
 
 

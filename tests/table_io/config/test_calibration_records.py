@@ -16,8 +16,9 @@ from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
 from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calibration_toml
 from table_io.errors import InputError
+from tests.builders.rigs import RIG_TEXT
 
-TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
+TEXT = RIG_TEXT
 TODAY = date(2026, 3, 10)
 HEAD = 'channel = "table_acc_m_s2"\nunit = "g"\n'
 

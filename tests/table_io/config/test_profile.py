@@ -15,8 +15,8 @@ from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2, UNITS
+from tests.builders.rigs import RIG_TEXT
 
-RIG_TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 TEST: dict[str, Any] = {
     "title": "a test",
     "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},

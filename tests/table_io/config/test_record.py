@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.excitation.record import RecordedHistory, resample
 from table_io.config.excitation.record_files import SeriesRequest, read_series
 from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
-from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import check_limits, compute_demands
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 TEST = """title = "a record"
 [specimen]
 mass_kg = 550.0

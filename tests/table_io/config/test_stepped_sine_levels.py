@@ -5,16 +5,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import check_limits, compute_demands
 from table_io.units import GRAVITY_M_S2
+from tests.builders.rigs import RIG
 from tests.input_errors import raises_input_error
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 GRID = {"start_hz": 1.0, "stop_hz": 4.0, "step_hz": 1.0, "cycles": 3}
 
 

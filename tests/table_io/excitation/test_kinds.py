@@ -10,26 +10,23 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Label
-from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.base import PROFILES_DIR
 from table_io.config.excitation import (
     ENTRY_POINT_GROUP,
     EXCITATIONS,
-    ExcitationPlan,
     History,
     find_excitation,
-    history_acceleration,
 )
 from table_io.config.profile import Profile, load_profile
-from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.excitation.drive import MAX_STOP_RATIO, Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
+from tests.builders.rigs import RIG
 from tests.table_io.excitation.pulse_train import PulseTrain
 
 ORBITS = Path(__file__).parents[1] / "acquisition" / "unstable_orbits.json"
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 SWEEP = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 3, "measured_cycles": 1}
 HELD_ORBITS = {
     "start_hz": 2.85,
@@ -79,12 +76,12 @@ def limits() -> list[float]:
     return [RIG.limits.stroke_mm * 1e-3, RIG.limits.velocity_mm_s * 1e-3, 9.80665]
 
 
-def test_every_registered_kind_has_an_example_here() -> None:
+def test_every_registered_kind_has_an_example() -> None:
     assert EXAMPLES.keys() == EXCITATIONS.keys()
 
 
 @every_kind
-def test_the_command_begins_and_ends_at_rest_without_a_jump(kind: str) -> None:
+def test_command_begins_and_ends_at_rest(kind: str) -> None:
     subject = drive(kind)
     command = subject.command(-50, subject.rest_start + 100)
     start = subject.segments[0].start
@@ -100,7 +97,7 @@ def test_the_command_begins_and_ends_at_rest_without_a_jump(kind: str) -> None:
     "samples",
     [pytest.param(1, marks=pytest.mark.slow), 7, pytest.param(64, marks=pytest.mark.slow), 500],
 )
-def test_cutting_into_blocks_changes_no_bit(kind: str, samples: int) -> None:
+def test_division_into_blocks_changes_no_bit(kind: str, samples: int) -> None:
     subject = plan_excitation(profile(kind)).decay_from(5000)
     end = min(subject.rest_start + 100, 9000)
     quantities: list[Callable[[int, int], Any]] = [
@@ -114,7 +111,7 @@ def test_cutting_into_blocks_changes_no_bit(kind: str, samples: int) -> None:
 
 
 @every_kind
-def test_a_stop_at_any_time_comes_to_rest_within_the_limits(kind: str) -> None:
+def test_stop_at_any_time_comes_to_rest(kind: str) -> None:
     subject = plan_excitation(profile(kind))
     own = peaks(subject.command(0, subject.planned_end), subject.rate_hz)
     for at in np.linspace(subject.segments[0].start, subject.planned_end, 60).astype(int).tolist():
@@ -131,7 +128,7 @@ def test_a_stop_at_any_time_comes_to_rest_within_the_limits(kind: str) -> None:
 
 
 @every_kind
-def test_labels_are_steps_or_windows_in_order(kind: str) -> None:
+def test_labels_are_steps_or_windows(kind: str) -> None:
     test = profile(kind)
     plan = test.plan
     subject = plan_excitation(test)
@@ -150,7 +147,7 @@ def test_labels_are_steps_or_windows_in_order(kind: str) -> None:
 
 
 @every_kind
-def test_level_and_band_are_those_of_what_is_played(kind: str) -> None:
+def test_level_and_band_are_those_of_the_drive(kind: str) -> None:
     test = profile(kind)
     subject, plan = plan_excitation(test), test.plan
     acceleration = subject.acceleration(0, subject.planned_end)
@@ -162,7 +159,7 @@ def test_level_and_band_are_those_of_what_is_played(kind: str) -> None:
 
 
 @every_kind
-def test_the_demands_cover_the_command_and_a_stop(kind: str) -> None:
+def test_demands_cover_command_and_stop(kind: str) -> None:
     subject = plan_excitation(profile(kind))
     rows = compute_demands(subject, profile(kind), RIG)
     own = peaks(subject.command(0, subject.planned_end), subject.rate_hz)
@@ -180,7 +177,7 @@ def test_the_demands_cover_the_command_and_a_stop(kind: str) -> None:
         assert (np.max(stops, axis=0) <= np.multiply(demands[-1], 1.01)).all()
 
 
-def test_a_sweep_and_kind_stepped_sine_are_the_same_test() -> None:
+def test_sweep_equals_kind_stepped_sine() -> None:
     raw = profile("stepped_sine").model_dump()
     older = {**raw, "sweep": SWEEP}
     del older["excitation"]
@@ -204,13 +201,13 @@ class Still(History):
 
 
 @pytest.mark.parametrize("kind", [Jump, Still])
-def test_a_history_that_cannot_be_played_is_refused(kind: type[History]) -> None:
+def test_history_in_motion_at_its_ends_is_refused(kind: type[History]) -> None:
     with pytest.raises(InputError) as refusal:
         kind(kind="mine").plan(2000.0)
     assert refusal.value.where == "excitation 'mine'"
 
 
-def test_a_copy_plays_its_own_values() -> None:
+def test_copy_of_a_kind_plays_its_values() -> None:
     test = profile("pulse_train")
     assert isinstance(test.excitation, PulseTrain)
     higher = test.excitation.model_copy(update={"height_mm": 10.0})
@@ -218,16 +215,6 @@ def test_a_copy_plays_its_own_values() -> None:
     assert test.model_copy(update={"excitation": higher}).plan.level_m_s2 == pytest.approx(
         2 * level
     )
-
-
-def test_a_plan_in_steps_needs_no_history() -> None:
-    plan = profile("stepped_sine").plan
-    assert isinstance(plan, ExcitationPlan)
-    assert (plan.history_m.size, plan.windows, len(plan.steps)) == (0, 0, 6)
-
-
-def test_the_acceleration_of_a_history_begins_from_rest() -> None:
-    assert history_acceleration(np.array([1.0, 2.0, 4.0]), 1.0).tolist() == [1.0, 1.0, -2.0]
 
 
 @pytest.mark.parametrize(
@@ -238,7 +225,7 @@ def test_the_acceleration_of_a_history_begins_from_rest() -> None:
         ("tests.table_io.excitation.missing:Kind", False),
     ],
 )
-def test_a_plug_in_adds_a_kind_under_its_entry_point(
+def test_find_excitation_of_a_plug_in(
     value: str, usable: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     entry = metadata.EntryPoint("mine", value, ENTRY_POINT_GROUP)

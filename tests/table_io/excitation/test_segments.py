@@ -256,17 +256,6 @@ def test_a_decay_lasts_as_its_first_segment_says_and_ends_with_the_drive() -> No
         assert stopped.rest_start == min(at + length, max(530, at))
 
 
-@pytest.mark.parametrize("segment", BLENDS[:2])
-def test_a_decay_in_a_blend_lasts_as_its_frequency_there_says(segment: Segment) -> None:
-    begin = 300
-    blend = replace(segment, start=begin)
-    hold = Segment(blend.end, 3000, Label.SETTLE, 0, blend.f1, blend.f1, 0.5, 0.5, 0.0)
-    drive = Drive(RATE_HZ, (blend, hold), ())
-    for at in range(begin, blend.end, 7):
-        length_s = max(2.0 / frequency_at(segment, (at - begin) / segment.count), 0.5)
-        assert -1e-9 <= drive.decay_from(at).rest_start - at - length_s * RATE_HZ < 1.0
-
-
 def test_outside_a_drive_its_first_or_last_segment_applies() -> None:
     drive = make_drive()
     assert drive.segment_at(0) is drive.segments[0]
@@ -300,3 +289,20 @@ def test_constants_of_the_blend_are_its_extremes() -> None:
     curvature = np.abs(60.0 * x * (1.0 - x) * (1.0 - 2.0 * x)).max()
     assert curvature == pytest.approx(MAX_BLEND_CURVATURE, rel=1e-4)
     assert (RAMP_CYCLES, RAMP_S) == (2.0, 0.5)
+
+
+@pytest.mark.parametrize("count", [0, 1, 6])
+@pytest.mark.parametrize("keep_from", [0, 5, 11, 14, 40])
+@pytest.mark.parametrize("first", [3, 9, 10, 13, 16, 20])
+def test_correction_is_replaced_sample_by_sample(first: int, keep_from: int, count: int) -> None:
+    old = {10 + k: 1.0 + k for k in range(6)}
+    new = {first + k: -1.0 - k for k in range(count)}
+    before = {index: value for index, value in old.items() if keep_from <= index < first}
+    correction = Correction(10, np.array(list(old.values())))
+    replaced = correction.replace_from(first, np.array(list(new.values())), keep_from)
+    for at, length in ((0, 60), (12, 1), (11, 4), (2, 8), (16, 9), (30, 5)):
+        for subject, values in ((correction, old), (replaced, before | new)):
+            expected = [values.get(index, 0.0) for index in range(at, at + length)]
+            np.testing.assert_array_equal(subject.displacement(at, length), expected)
+    assert replaced.end == first + count
+    assert replaced.start == min(max(10, keep_from), first)

@@ -13,7 +13,6 @@ from table_io.excitation.drive import Drive, HistorySegment, Segment, peak_accel
 from table_io.excitation.trajectory import (
     SineTarget,
     Trajectory,
-    cycles_to_samples,
     plan_sweep,
     start_trajectory,
 )
@@ -174,27 +173,6 @@ def test_a_trajectory_starts_after_its_rest(rate_hz: float, rest_s: float) -> No
     assert (start.rate_hz, start.target, start.segments) == (rate_hz, SineTarget(2.0, 0.0), ())
 
 
-@pytest.mark.parametrize("frequency_hz", [0.5, 0.7, 3.4, 9.9])
-def test_cycles_are_rounded_up_to_samples(frequency_hz: float) -> None:
-    step = Step(0, "forward", frequency_hz, 0.5)
-    for cycles in range(1, 12):
-        spare = cycles_to_samples(step, cycles, RATE_HZ) - cycles / frequency_hz * RATE_HZ
-        assert -1e-9 <= spare < 1.0
-
-
-def test_a_sweep_holds_each_step_from_its_first_one() -> None:
-    profile = make_profile()
-    for first_step in (0, 2):
-        resume = {"resume": {"first_step": first_step, "of": "run"}} if first_step else {}
-        drive = plan_sweep(make_profile(**resume))
-        held = [segment for segment in drive.sine_segments if segment.cycles]
-        assert [segment.step for segment in held] == [
-            step.index for step in profile.plan.steps[first_step:]
-        ]
-        assert {(segment.cycles, segment.settle) for segment in held} == {(5, 3)}
-        assert {segment.label for segment in held} == {Label.MEASURE}
-
-
 def test_every_orbit_of_a_continuation_is_settled_and_measured() -> None:
     profile = make_example("continuation")
     assert profile.continuation is not None
@@ -205,7 +183,3 @@ def test_every_orbit_of_a_continuation_is_settled_and_measured() -> None:
     for segment in held:
         assert (segment.cycles, segment.settle) == (cycles, settle)
         assert -1e-9 <= segment.count - cycles / segment.f0 * profile.acquisition.rate_hz < 1.0
-
-
-def test_the_corrected_level_is_the_product() -> None:
-    assert SineTarget(3.0, 0.5, 1.5).corrected_m_s2 == 0.75

@@ -12,14 +12,15 @@ from table_io.backends import MachineLost, find_descriptor
 from table_io.backends.ni.config import NiWiring
 from table_io.backends.ni.driver import NiDigitalInputs
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.safety.wiring_check import CheckLine, check_digital_inputs
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.service import NiDeviceService
+from tests.builders.rigs import RIG_TEXT, read_rig_text
 
-TEXT = (PROFILES_DIR / "rigs" / "ni_simulated.toml").read_text(encoding="utf-8")
+TEXT = read_rig_text("ni_simulated")
 WATCHED = """
 heartbeat_back = "Dev1/port0/line1"
 well = { "stroke limit right" = "Dev1/port0/line2" }
@@ -73,7 +74,7 @@ def test_a_card_without_such_inputs_opens_none() -> None:
     open_digital_inputs = find_descriptor(rig).open_digital_inputs
     assert open_digital_inputs is not None
     assert open_digital_inputs(rig) is None
-    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    text = RIG_TEXT
     assert find_descriptor(parse_toml(text, RigConfig, "c")).open_digital_inputs is None
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Float2D
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.rig import RigConfig
 from table_io.safety.wiring_check import (
     CheckLine,
@@ -17,8 +16,8 @@ from table_io.safety.wiring_check import (
     is_disturbed,
     list_stimuli,
 )
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 RATE, SAMPLES, BEFORE, AT = 2000.0, 3000, 800, 1500
 NOISE = np.array([sensor.noise_rms for sensor in RIG.sensors])
 TABLE, MASS, RIGHT, LEFT = list_stimuli(RIG)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from table_io.block import Float2D
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.rig import RigConfig
 from table_io.safety.wiring_check import (
     CheckLine,
@@ -15,8 +14,8 @@ from table_io.safety.wiring_check import (
     check_zero_command,
     fit_mains_hum,
 )
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 RATE, SAMPLES = 2000.0, 8000
 ACC = RIG.channels.index("table_acc_m_s2")
 LASER = RIG.channels.index("table_disp_m")

@@ -11,7 +11,6 @@ import pytest
 from table_io.block import Block, Float1D, Label
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Level, Record
@@ -26,10 +25,10 @@ from table_io.sequencer.procedure import (
 from table_io.sequencer.state import SequencerState
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
+from tests.builders.rigs import RIG
 
 RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
 
 

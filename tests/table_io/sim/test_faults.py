@@ -8,17 +8,16 @@ import pytest
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
 from table_io.block import Float1D, Float2D
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.calibration import command_to_volts
-from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.config import FAULT_KINDS
 from table_io.sim.faults import CONVERTER_NOISE_RATIO, VALVE_CLOSING_S
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.builders.rigs import RIG, make_faulty_rig
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import RIG, RIG_TEXT, make_faulty_rig
 
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
 AT, FOR = 1.0005, 0.25  # s: not where reads begin
 FIRST, LAST = 2001, 2501
@@ -228,7 +227,7 @@ def test_without_oil_the_bandwidth_falls() -> None:
 
 
 def refusal(text: str) -> str:
-    card = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    card = RIG_TEXT
     with pytest.raises(InputError) as caught:
         parse_toml(f"{card}\n[[simulated.faults]]\n{text}\n", RigConfig, "rig.toml")
     return str(caught.value)

@@ -12,7 +12,6 @@ from table_io.block import Float1D, Float2D
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, load_config, parse_toml
 from table_io.config.calibration import compute_tare, volts_to_si
-from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.config import SimulatedTableConfig
@@ -23,6 +22,7 @@ from table_io.sim.ground_truth import (
     parse_ground_truth,
 )
 from table_io.sim.simulated_table import SensorDistortion, SimulatedBackend
+from tests.builders.profiles import SPECIMEN
 from tests.builders.truths import seal_truth
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
@@ -32,7 +32,6 @@ from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced
 
 CARD, CARD_TOML = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
 ACC = CARD.channels.index("mass_acc_m_s2")
 PHYSICS = """

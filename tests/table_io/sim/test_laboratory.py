@@ -10,9 +10,8 @@ from scipy import signal
 
 from table_io.block import Float1D, Float2D
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.calibration import compute_tare, volts_to_si
-from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.ground_truth import GroundTruth
@@ -26,10 +25,10 @@ from table_io.sim.imperfections import (
 from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import Plant
 from table_io.sim.simulated_table import Digitizer, SimulatedBackend, hide_laws
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "rig")[0]
 CHANNELS = RIG.channels
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
 GRAVITY_M_S2 = 9.80665
 TURN = 2 * np.pi

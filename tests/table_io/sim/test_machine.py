@@ -22,18 +22,18 @@ from table_io.backends.machine.protocol import (
     values_message,
 )
 from table_io.block import Float1D
-from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.profile import Specimen
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
 from tests.builders.flight_records import read_flight_record
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import read_rig_text
 
 RATE_HZ = 2000.0
-TEXT = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
+TEXT = read_rig_text("machine")
 RIG = parse_toml(TEXT, RigConfig, "machine")
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 SCALE = RIG.output.volts_per_m
 TICK_S = 0.005
 LATE = """
@@ -136,23 +136,6 @@ class Desk:
 @pytest.fixture
 def desk(tmp_path: Path) -> Desk:
     return Desk(tmp_path)
-
-
-def test_the_shipped_machine_is_the_simulated_one_in_a_process_of_its_own() -> None:
-    own = {"name", "title", "backend", "machine"}
-    simulated = parse_toml(
-        (PROFILES_DIR / "rigs" / "simulated.toml").read_text(), RigConfig, "simulated"
-    )
-    assert RIG.model_dump(exclude=own) == simulated.model_dump(exclude=own)
-
-
-def test_it_plays_and_hands_over_every_sample_once(desk: Desk) -> None:
-    desk.drive(sine(0.5))
-    desk.wait(0.3)
-    assert set(desk.kinds()) == {MessageKind.TAKEN}
-    counts = [answer.values.size // len(RIG.sensors) for answer in desk.answers]
-    assert [answer.index for answer in desk.answers] == np.cumsum([0, *counts[:-1]]).tolist()
-    assert sum(counts) == 601  # sample 0 is that of the start
 
 
 def test_a_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(desk: Desk) -> None:

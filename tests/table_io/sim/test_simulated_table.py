@@ -1,36 +1,20 @@
 """The simulated machine: its converters, its queue, its clock, and bit-exact repeatability."""
 
 import time
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
 from table_io.block import Float1D, Float2D
 from table_io.clock import ManualClock, RealClock
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import command_to_volts, compute_tare, volts_to_si
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.profiles import SPECIMEN
+from tests.builders.rigs import RIG
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
-SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 RATE_HZ = 2000.0
-
-
-@dataclass
-class Fixed:
-    """A clock that notes what it was asked to wait for."""
-
-    waited: list[float]
-
-    def now(self) -> float:
-        return 100.0
-
-    def wait_until(self, when: float) -> None:
-        self.waited.append(when)
 
 
 def rig(**simulated: object) -> RigConfig:
@@ -51,7 +35,7 @@ def sensors(**changes: object) -> RigConfig:
 def backend(
     card: RigConfig = RIG,
     specimen: Specimen = SPECIMEN,
-    clock: ManualClock | RealClock | Fixed | None = None,
+    clock: ManualClock | RealClock | None = None,
     rate_hz: float = RATE_HZ,
 ) -> SimulatedBackend:
     """An open backend that has not started."""
@@ -80,33 +64,12 @@ def row(values: Float2D, channel: str) -> Float1D:
     return line
 
 
-def test_the_cut_into_reads_changes_no_bit() -> None:
-    whole = play_run(command(2.0), [4000])
-    assert np.abs(row(whole, "force_r1_n")).max() > 0.1  # it did impact: over 100 N
-    for samples in (1, 7, 64, 500):
-        cuts = [samples] * (4000 // samples) + [4000 % samples]
-        assert play_run(command(2.0), cuts).tobytes() == whole.tobytes(), samples
-
-
 def test_every_clock_sees_the_same_samples_and_the_real_one_keeps_time() -> None:
     fast = play_run(command(0.5), [20] * 20)
     before = time.monotonic()
     real = play_run(command(0.5), [20] * 20, clock=RealClock())
     assert time.monotonic() - before >= 399 / RATE_HZ
     assert real.tobytes() == fast.tobytes()
-
-
-def test_read_waits_for_its_last_sample_and_for_nothing_else() -> None:
-    clock = Fixed([])
-    machine = backend(clock=clock)
-    machine.tare(100)
-    machine.queue(0, command(0.1))
-    machine.start()
-    assert clock.waited == []
-    machine.read(20)
-    machine.read(5)
-    assert clock.waited == [100.0 + 19 / RATE_HZ, 100.0 + 24 / RATE_HZ]
-    assert machine.scheduled_time_s(2000) == 101.0
 
 
 def test_the_seed_decides_the_noise() -> None:
@@ -194,72 +157,6 @@ def test_the_cells_of_a_side_share_its_force_in_compression() -> None:
     assert np.median(np.abs(lost)) < 0.5
 
 
-def test_beyond_the_queue_the_command_holds_its_last_value() -> None:
-    drive = play_run(np.array([0.0, 0.5, 1.0]), [2, 3, 40])[0]
-    np.testing.assert_allclose(drive[2:], drive[2])
-    assert drive[2] == pytest.approx(6e-3 * RIG.sensors[0].volts_per_si, rel=1e-4)
-
-
-def test_a_replaced_command_plays_from_its_index_on() -> None:
-    volts = command(1.0)
-    machine = backend()
-    machine.queue(0, volts)
-    machine.start()
-    head = machine.read(100)
-    index = 99 + machine.replace_after
-    machine.queue(index, np.full(5, volts[index]))
-    replaced = np.concatenate([head, machine.read(400)], axis=1)
-    expected = volts.copy()
-    expected[index:] = volts[index]
-    assert replaced.tobytes() == play_run(expected, [500]).tobytes()
-
-
-def test_a_gap_in_the_queue_holds_the_value_before_it() -> None:
-    machine = backend()
-    machine.queue(0, np.array([0.0, 1.0]))
-    machine.queue(50, np.array([2.0]))
-    machine.start()
-    filled = np.concatenate([[0.0], np.full(49, 1.0), [2.0]])
-    assert machine.read(100).tobytes() == play_run(filled, [100]).tobytes()
-
-
-@pytest.mark.parametrize("rate_hz", RIG.rates_hz)
-def test_what_is_in_the_device_cannot_be_replaced(rate_hz: float) -> None:
-    machine = backend(rate_hz=rate_hz)
-    assert machine.replace_after <= 0.05 * rate_hz
-    machine.queue(0, command(1.0))
-    machine.start()
-    machine.read(100)
-    earliest = 99 + machine.replace_after
-    with pytest.raises(ValueError, match=rf"\b{earliest}\b"):
-        machine.queue(earliest - 1, np.zeros(10))
-    machine.queue(earliest, np.zeros(10))
-
-
-@pytest.mark.parametrize("away_s", [0.0, 0.001, 0.3])
-def test_the_machine_plays_on_while_nobody_reads(away_s: float) -> None:
-    clock = ManualClock()
-    machine = backend(clock=clock)
-    machine.queue(0, command(1.0))
-    machine.start()
-    machine.read(100)
-    clock.wait_until(clock.now() + away_s)
-    newest = 99 + round(away_s * RATE_HZ)
-    earliest = newest + machine.replace_after
-    with pytest.raises(ValueError, match=rf"\b{earliest}\b"):
-        machine.queue(earliest - 1, np.zeros(10))
-    machine.queue(earliest, np.zeros(10))
-    volts = command(1.0)
-    volts[earliest:] = 0.0
-    behind = machine.read(900)
-    assert behind.tobytes() == play_run(volts, [100, 900])[:, 100:].tobytes()
-
-
-def test_a_command_that_is_no_number_is_refused() -> None:
-    with pytest.raises(ValueError, match="NaN"):
-        backend().queue(0, np.array([0.0, np.nan]))
-
-
 def test_the_queue_does_not_grow_with_the_test() -> None:
     machine = backend()
     machine.queue(0, np.zeros(1000))
@@ -268,21 +165,3 @@ def test_the_queue_does_not_grow_with_the_test() -> None:
         machine.read(200)
         machine.queue(taken + 100, np.zeros(1000))
     assert machine._command.size < 1300
-
-
-def test_order_of_life_and_rates_are_kept() -> None:
-    with pytest.raises(InputError) as error:
-        backend(rate_hz=1234.0)
-    assert (error.value.key, error.value.value) == ("acquisition.rate_hz", 1234.0)
-    assert error.value.allowed == "1000, 2000, 4000 Hz"
-    unopened = SimulatedBackend(RIG, SPECIMEN, RATE_HZ, ManualClock())
-    with pytest.raises(RuntimeError, match="open"):
-        unopened.queue(0, np.zeros(1))
-    machine = backend()
-    with pytest.raises(RuntimeError, match="start"):
-        machine.read(1)
-    machine.start()
-    machine.close()
-    machine.close()
-    with pytest.raises(RuntimeError, match="closed"):
-        machine.read(1)

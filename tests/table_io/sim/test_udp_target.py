@@ -251,31 +251,6 @@ def desk(request: pytest.FixtureRequest, tmp_path: Path) -> Desk:
     return Desk(request.param(tmp_path))
 
 
-def test_it_plays_its_command_and_sends_every_sample_once(desk: Desk) -> None:
-    volts = sine(1.0)
-    desk.drive(volts)
-    desk.wait(0.5)
-    rows = desk.samples()
-    assert sorted(rows) == list(range(len(rows)))
-    assert len(rows) >= 1001 - 4
-    assert sum(s.values.size for s, _ in desk.sent_states if s.phase is Phase.RUNNING) == 9 * len(
-        rows
-    )
-    check_played(desk, volts[:1000])
-    drive = np.array([rows[i][0] for i in range(len(rows))])
-    assert np.abs(drive - volts[: drive.size]).max() <= 0.501 * 20.0 / 2**18 + 20.0 / 2**24
-
-
-def test_at_rest_it_sends_samples_from_the_claim_on(desk: Desk) -> None:
-    desk.claim()
-    state = desk.wait(0.1)
-    assert state.phase is Phase.CLAIMED
-    assert state.taken >= 200 - 4
-    sent = [s.index + k for s, _ in desk.sent_states for k in range(s.values.size // 9)]
-    assert sent == list(range(len(sent)))
-    assert len(sent) >= 190
-
-
 def test_a_command_is_replaced_at_once_and_whole(desk: Desk) -> None:
     volts, other = sine(1.0), np.linspace(0.0, 0.0, 700)
     desk.drive(volts)

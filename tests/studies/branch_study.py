@@ -1,6 +1,6 @@
 """The unstable branch of G4 on the simulated table, against the orbits of that plant by shooting.
 
-As a script, as fast as it computes: python -m tests.table_io.acquisition.branch_study --help.
+As a script, as fast as it computes: python -m tests.studies.branch_study --help.
 Neither twin nor recording take part; the plan is that of the nominal model.
 """
 
