@@ -60,7 +60,7 @@ def test_time_comes_from_the_index() -> None:
     assert np.array_equal(join_blocks(pieces(whole, [7])).time_s, whole.time_s)
 
 
-def test_a_channel_that_is_not_there_names_what_there_is() -> None:
+def test_missing_channel_is_named_with_those_present() -> None:
     assert np.array_equal(block().channel("table_acc_m_s2"), block().values[2])
     with pytest.raises(KeyError, match=r"force_r1_n.* drive_disp_m, table_disp_m"):
         block().channel("force_r1_n")
@@ -86,7 +86,7 @@ def test_recut_and_join_give_back_every_bit(samples: int) -> None:
     samples=st.sampled_from([1, 3, 7, 64, 500]),
 )
 @settings(max_examples=40)
-def test_a_recut_does_not_know_how_the_samples_came(sizes: list[int], samples: int) -> None:
+def test_recut_is_independent_of_the_blocks(sizes: list[int], samples: int) -> None:
     whole = block()
     straight = list(recut_blocks([whole], samples))
     again = list(recut_blocks(pieces(whole, sizes), samples))
@@ -105,7 +105,7 @@ def test_a_recut_does_not_know_how_the_samples_came(sizes: list[int], samples: i
     ],
     ids=["gap", "overlap", "stream", "rate", "channels"],
 )
-def test_join_refuses_what_does_not_continue(second: Block) -> None:
+def test_join_refuses_a_discontinuity(second: Block) -> None:
     first = block(20, index=40)
     assert len(join_blocks([first, block(20, index=60)])) == 40
     with pytest.raises(ValueError, match="does not continue"):
@@ -121,7 +121,7 @@ def test_cut_refuses_samples_that_it_does_not_have(window: tuple[int, int]) -> N
 
 
 @pytest.mark.parametrize("name", ["stream", "index", "rate_hz", "values", "step", "label", "cycle"])
-def test_identical_sees_every_field(name: str) -> None:
+def test_identical_compares_every_field(name: str) -> None:
     whole = block(20)
     others: dict[str, Any] = {"stream": "pred", "index": 41, "rate_hz": 1000.0}
     other = others.get(name)
@@ -133,7 +133,7 @@ def test_identical_sees_every_field(name: str) -> None:
     assert not whole.is_identical(block(20, **{name: other}))
 
 
-def test_identical_tells_a_negative_zero_from_a_zero() -> None:
+def test_identical_distinguishes_a_negative_zero() -> None:
     zero = block(20).values.copy()
     assert np.signbit(zero[1, 2])
     zero[1, 2] = 0.0

@@ -98,7 +98,7 @@ def run_kernel(folder: Path, cache: Path) -> list[str]:
     return completed.stdout.split()
 
 
-def test_a_kernel_follows_a_function_in_another_file(tmp_path: Path) -> None:
+def test_kernel_follows_a_function_in_another_file(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     write_package(tmp_path, "plant_laws")
     (cache / "removed_installation").mkdir(parents=True)
@@ -224,7 +224,7 @@ def test_kernels_name_all_modules_that_they_are_made_of() -> None:
     )
 
 
-def test_a_cache_that_cannot_be_written_costs_only_time(
+def test_cache_that_cannot_be_written_costs_only_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", "/proc/no_folder")
@@ -243,7 +243,7 @@ def test_a_cache_that_cannot_be_written_costs_only_time(
 
 
 @pytest.mark.parametrize("damaged", ["*.nbi", "*.nbc"])
-def test_a_damaged_file_is_compiled_and_written_again(
+def test_damaged_file_is_compiled_and_written_again(
     damaged: str, tmp_path: Path, import_package: Any
 ) -> None:
     total = sum(VALUES.values())
@@ -258,7 +258,7 @@ def test_a_damaged_file_is_compiled_and_written_again(
         assert sum(kernel.stats.cache_hits.values()) == hits
 
 
-def test_a_full_disk_costs_only_time(import_package: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_costs_only_time(import_package: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
@@ -291,7 +291,7 @@ def test_kernels_of_removed_installations_are_removed(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign", "kept"]
 
 
-def test_a_part_of_kernels_is_plain_python_outside_of_them() -> None:
+def test_part_of_kernels_is_plain_python_outside_of_them() -> None:
     @jit_helper()
     def part(x: float) -> float:
         return 2.0 * x

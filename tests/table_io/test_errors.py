@@ -5,7 +5,7 @@ import pickle
 from table_io.errors import MAX_LISTED_NAMES, InputError, suggest
 
 
-def test_the_closest_known_name_is_suggested() -> None:
+def test_closest_known_name_is_suggested() -> None:
     assert "'cycles'" in suggest("cycels", ["cycles", "circles", "start_hz"])
     assert "start_hz" not in suggest("cycels", ["cycles", "start_hz"])
 
@@ -18,13 +18,13 @@ def test_without_a_close_name_all_are_listed() -> None:
     assert text.endswith(" 3 more")
 
 
-def test_a_message_has_its_fields_in_order() -> None:
+def test_message_has_its_fields_in_order() -> None:
     error = InputError("too low", where="a.toml", key="k", value=1, allowed="2", remedy="raise it")
     places = [str(error).index(part) for part in ("a.toml", "k = 1", "too low", "2", "raise it")]
     assert places == sorted(places)
 
 
-def test_the_faults_of_a_file_keep_their_fields_and_stand_one_a_line() -> None:
+def test_faults_of_a_file_keep_their_fields_and_stand_one_a_line() -> None:
     gap = InputError("missing", key="specimen.gap_mm", remedy="add it")
     mass = InputError("too small", key="specimen.mass_kg", value=-1.0, allowed="above 0")
     error = pickle.loads(pickle.dumps(InputError("", where="a.toml", faults=(gap, mass))))
@@ -44,7 +44,7 @@ def test_each_fault_is_on_lines_of_its_own_below_its_place() -> None:
     assert [fault.where for fault in error.faults] == ["a.toml", ""]
 
 
-def test_an_added_place_stands_before_the_others_and_keeps_the_fields() -> None:
+def test_added_place_stands_before_the_others_and_keeps_the_fields() -> None:
     error = InputError("too low", where="a.toml", key="k", value=1, allowed="2", remedy="raise it")
     placed = error.add_place("case 3")
     assert placed.where == "case 3: a.toml"

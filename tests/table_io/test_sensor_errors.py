@@ -62,7 +62,7 @@ def test_errors_of_sound_sensors_are_measured(
     assert clean.mismatch < 0.015 * clean.size
 
 
-def test_a_low_cut_of_half_the_frequency_is_known_once_its_estimate_has_settled() -> None:
+def test_low_cut_of_half_the_frequency_is_known_once_its_estimate_has_settled() -> None:
     """Equations made with the first, wrong low cuts do not linger in the estimate."""
     hz, low_cut_hz = 0.5, 0.25
     t = np.arange(round(40 * RATE_HZ)) / RATE_HZ
@@ -90,7 +90,7 @@ def test_no_low_cut_or_delay_explains_a_wrong_gain(gain: float) -> None:
     assert left.mismatch > 0.15 * left.size
 
 
-def test_a_low_cut_beyond_that_of_sound_sensors_is_left() -> None:
+def test_low_cut_beyond_that_of_sound_sensors_is_left() -> None:
     _, pair = compare_cycles(*record_motion(1.0, 4.0, 0.0))
     errors = pair.fit_phase_errors()
     assert errors.low_cut <= MAX_LOW_CUT_RAD_S
@@ -98,7 +98,7 @@ def test_a_low_cut_beyond_that_of_sound_sensors_is_left() -> None:
     assert left.mismatch > 0.3 * left.size
 
 
-def test_the_division_into_calls_changes_no_bit() -> None:
+def test_division_into_calls_changes_no_bit() -> None:
     x, _ = record_motion(1.0, 0.0, 0.0)
     x[700:703] = np.nan
     whole = highpass(x, 1.0, RATE_HZ)
@@ -109,7 +109,7 @@ def test_the_division_into_calls_changes_no_bit() -> None:
 
 
 @pytest.mark.parametrize("b1", [0.0, 0.3])
-def test_the_filter_is_that_of_scipy_to_the_bit(b1: float) -> None:
+def test_filter_is_that_of_scipy_to_the_bit(b1: float) -> None:
     x = np.random.default_rng(1).standard_normal(500)
     y, state = filter_first_order(x, (0.3, b1), 0.98, 0.7)
     expected, expected_state = signal.lfilter([0.3, b1], [1.0, -0.98], x, zi=[0.7])

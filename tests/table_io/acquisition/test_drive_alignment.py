@@ -81,7 +81,7 @@ def places(follower: DriveFollower) -> Int1D:
     return take_drive_indices(follower, follower.located_end)[1]
 
 
-def test_a_drive_is_evaluated_between_its_samples(drive: Drive) -> None:
+def test_drive_is_evaluated_between_its_samples(drive: Drive) -> None:
     """Against its own closed form, by the same drive planned at four times the rate."""
     at = np.linspace(3000.25, 3399.25, 400)
     value, slope = interpolate_drive(drive, at)
@@ -99,7 +99,7 @@ def test_a_drive_is_evaluated_between_its_samples(drive: Drive) -> None:
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.13, 0.5, 0.91])
-def test_a_shift_within_a_sample_is_found(drive: Drive, shift: float) -> None:
+def test_shift_within_a_sample_is_found(drive: Drive, shift: float) -> None:
     file = drive.command(0, 6000)
     played = DrivePlayback(file, RATE_HZ, RATE_HZ, 800.0 + shift)
     fit = fit_alignment(drive, 0, played.command(0, 4000), -790.0, RATE_HZ, LSB)
@@ -129,7 +129,7 @@ def test_samples_keep_their_places_under_another_clock(
     assert np.abs(drive_indices[moving] - acquisition.place[moving]).max() < (4.0 if check else 2.0)
 
 
-def test_how_the_samples_are_cut_changes_no_place(drive: Drive) -> None:
+def test_division_of_samples_changes_no_place(drive: Drive) -> None:
     acquisition = acquire(drive, 12.0, ppm=-40.0, noise=0.002)
     drive_indices = [
         places(follow_drive(drive, acquisition.command, 1e-6, cut)) for cut in (1000, 7, 64, 500)
@@ -138,7 +138,7 @@ def test_how_the_samples_are_cut_changes_no_place(drive: Drive) -> None:
         assert np.array_equal(drive_indices[0], other)
 
 
-def test_the_soft_start_is_in_the_drive_though_it_was_seen_late(drive: Drive) -> None:
+def test_soft_start_below_the_noise_has_its_place(drive: Drive) -> None:
     acquisition = acquire(drive, 10.0, noise=0.04)
     sigma = 0.04 * float(np.abs(drive.command(0, drive.rest_start)).max())
     follower = follow_drive(drive, acquisition.command, sigma)
@@ -178,7 +178,9 @@ def other(drive: Drive, what: str, at: int) -> Float1D:
 
 @pytest.mark.parametrize("what", ["stands still", "stops gently", "jumps back", "is a quarter"])
 @pytest.mark.parametrize("at", [13000, 13333])
-def test_a_drive_that_is_left_is_seen_within_a_second(drive: Drive, what: str, at: int) -> None:
+def test_departure_from_the_drive_is_detected_within_a_second(
+    drive: Drive, what: str, at: int
+) -> None:
     command = other(drive, what, at)
     before = follow_drive(drive, command[:at])
     assert before.state == "playing"
@@ -191,7 +193,7 @@ def test_a_drive_that_is_left_is_seen_within_a_second(drive: Drive, what: str, a
 @pytest.mark.parametrize(
     ("share", "words"), [(-1.0, "inverted sign"), (0.0, "not this drive")], ids=["sign", "noise"]
 )
-def test_what_is_not_the_drive_is_told(drive: Drive, share: float, words: str) -> None:
+def test_other_command_is_recognized(drive: Drive, share: float, words: str) -> None:
     command = share * acquire(drive, 12.0).command
     if not share:
         t = np.arange(command.size - 5000) / RATE_HZ
@@ -204,7 +206,7 @@ def test_what_is_not_the_drive_is_told(drive: Drive, share: float, words: str) -
     assert (places(follower) == REST_INDEX).all()
 
 
-def test_one_spike_is_no_motion(drive: Drive) -> None:
+def test_spike_is_no_motion(drive: Drive) -> None:
     command = np.zeros(6000)
     command[3123] = 5e-3
     assert follow_drive(drive, command).onset is None
@@ -232,12 +234,12 @@ def test_another_amplitude_is_not_the_drive(drive: Drive, gain: float, at: int) 
     )
 
 
-def test_an_amplitude_within_a_third_is_followed(drive: Drive) -> None:
+def test_amplitude_within_a_third_is_followed(drive: Drive) -> None:
     follower = follow_drive(drive, 0.75 * acquire(drive, 12.0).command)
     assert follower.state == "playing"
 
 
-def test_what_was_left_does_not_change_what_is_said_of_its_clock(drive: Drive) -> None:
+def test_departure_does_not_change_the_stated_clock(drive: Drive) -> None:
     """Half a second of decay drags the place along before it is seen."""
     command = acquire(drive, 16.0, ppm=50.0).command.copy()
     command[16100:] *= np.clip(1.0 - np.arange(command.size - 16100) / RATE_HZ, 0.0, 1.0) ** 3

@@ -98,7 +98,7 @@ def loop_check_recording() -> Followed:
     return run(setup(check=True))
 
 
-def test_the_whole_is_recorded_from_the_start_of_the_acquisition_on(
+def test_whole_is_recorded_from_the_start_of_the_acquisition_on(
     loop_check_recording: Followed,
 ) -> None:
     block = loop_check_recording.block  # which joins: no sample is missing
@@ -129,7 +129,7 @@ def test_every_sample_is_labelled_by_its_place_in_the_drive(loop_check_recording
         assert len(wrong) - len(unseen) <= len(np.flatnonzero(np.diff(drive)))
 
 
-def test_the_loop_check_is_judged_and_how_it_was_aligned_is_said(
+def test_loop_check_and_alignment_are_recorded(
     loop_check_recording: Followed,
 ) -> None:
     checks = loop_check_recording.of(Check)
@@ -145,7 +145,7 @@ def test_the_loop_check_is_judged_and_how_it_was_aligned_is_said(
     assert not loop_check_recording.of(Trip)
 
 
-def test_a_loop_check_that_fails_stops_nothing_and_says_so() -> None:
+def test_failed_loop_check_is_an_event_and_stops_nothing() -> None:
     text = find_config("follow_simulated", "rigs").read_text()
     text += '\n[[simulated.faults]]\nkind = "polarity"\nat_s = 0.0\nchannel = "table_acc_m_s2"\n'
     recording = run(setup(check=True, text=text))
@@ -156,7 +156,7 @@ def test_a_loop_check_that_fails_stops_nothing_and_says_so() -> None:
     assert "protection would have stopped it" in recording.stop.reason or not recording.of(Trip)
 
 
-def test_what_protection_sees_is_in_the_record_and_the_table_goes_on() -> None:
+def test_trip_is_recorded_while_the_table_goes_on() -> None:
     text = find_config("follow_simulated", "rigs").read_text()
     text += '\n[[simulated.faults]]\nkind = "cable_off"\nat_s = 5.0\nchannel = "table_disp_m"\n'
     recording = run(setup(text=text))
@@ -167,7 +167,7 @@ def test_what_protection_sees_is_in_the_record_and_the_table_goes_on() -> None:
     assert "see the trip" in recording.stop.reason
 
 
-def test_a_controller_that_stops_early_is_seen_and_recorded_to_rest() -> None:
+def test_controller_that_stops_early_is_recorded_to_rest() -> None:
     recording = run(setup(), stopped_early)
     left = (
         next(s.end for s in sine_segments(recording.drive) if s.step == 1)
@@ -196,7 +196,7 @@ def test_another_drive_is_not_taken_for_ours() -> None:
     assert (recording.block.step == -1).all()
 
 
-def test_nothing_played_is_the_end_after_the_cards_time() -> None:
+def test_recording_ends_if_nothing_is_played() -> None:
     text = (
         find_config("follow_simulated", "rigs")
         .read_text()
@@ -213,7 +213,7 @@ def order(name: str, at: int, asked: int) -> OperatorCommand | None:
 
 
 @pytest.mark.parametrize("name", ["hold", "resume"])
-def test_hold_and_resume_are_refused_with_words(name: str) -> None:
+def test_hold_and_resume_are_refused(name: str) -> None:
     recording = run(setup(), orders=partial(order, name, 300))
     (text,) = recording.event_texts("refused")
     assert name in text
@@ -222,7 +222,7 @@ def test_hold_and_resume_are_refused_with_words(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "verdict"), [("stop", "stopped"), ("abort", "aborted")])
-def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: str) -> None:
+def test_stop_ends_the_recording_of_a_moving_table(name: str, verdict: str) -> None:
     """The controller plays on: ten seconds later the recording ends, and says that it moves."""
     long = setup(excitation=SWEEP | {"cycles": 20})
     recording = run(long, orders=partial(order, name, 500))
@@ -233,7 +233,7 @@ def test_a_stop_says_where_to_stop_and_ends_the_recording(name: str, verdict: st
     assert recording.stop.states[-1] == "left"
 
 
-def test_a_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None:
+def test_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None:
     recording = run(setup(), stopped_early, orders=partial(order, "stop", 500))
     left = (
         next(s.end for s in sine_segments(recording.drive) if s.step == 1)
@@ -249,13 +249,13 @@ def test_a_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None
     assert np.abs(recording.block.channel("drive_disp_m")[-300:]).max() < 1e-6
 
 
-def test_a_stop_while_waiting_ends_at_once() -> None:
+def test_stop_while_waiting_ends_at_once() -> None:
     recording = run(setup(), orders=partial(order, "stop", 20))
     assert recording.stop.verdict == "stopped"
     assert recording.block.end <= 30 * 20
 
 
-def test_a_test_that_decides_while_it_runs_cannot_be_given_away() -> None:
+def test_test_that_decides_while_it_runs_cannot_be_given_away() -> None:
     profile = load_config(find_config("track", "tests"), Profile, "profile")[0]
     with pytest.raises(InputError) as error:
         plan_open_loop_drive(profile, setup().rig)
@@ -271,7 +271,7 @@ class Breaking(Bystander):
         return super().take(samples)
 
 
-def test_a_lost_device_leaves_all_that_was_acquired() -> None:
+def test_lost_device_keeps_all_acquired_samples() -> None:
     recording = run(setup(), kind=Breaking)
     assert recording.stop.verdict == "halted"
     assert recording.block.end == recording.stop.index == 12020
@@ -305,7 +305,7 @@ def test_where_no_command_is_wired_the_table_stands_for_it() -> None:
         assert 10 <= first - expected - (-true[0] - round(DRIVE_START_SAMPLE)) <= 60
 
 
-def test_the_card_wants_its_source() -> None:
+def test_card_wants_its_source() -> None:
     text = find_config("follow_simulated", "rigs").read_text()
     bare = text[: text.index("\n[opendaq]")] + text[text.index("\n[limits]") :]
     with pytest.raises(InputError) as error:

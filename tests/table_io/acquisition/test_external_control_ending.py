@@ -35,7 +35,7 @@ class Floating(Bystander):
         return volts
 
 
-def test_a_command_that_never_rests_again_ends_the_recording() -> None:
+def test_command_that_never_rests_again_ends_the_recording() -> None:
     """As long after the motion began as the drive takes, not at the operator's patience."""
     recording = run(
         setup(), kind=Floating, orders=lambda n: pytest.fail("for ever") if n > 5000 else None
@@ -46,7 +46,7 @@ def test_a_command_that_never_rests_again_ends_the_recording() -> None:
     assert recording.stop.states[-1] == "left"
 
 
-def test_a_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_on() -> None:
+def test_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_on() -> None:
     long = setup(check=True, excitation=SWEEP | {"cycles": 12})
     drive = plan_open_loop_drive(long.profile, long.rig)
     sweep = next(segment.start for segment in sine_segments(drive) if segment.step == 0)
@@ -58,7 +58,7 @@ def test_a_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_play
     assert (recording.block.label == Label.MEASURE).any()
 
 
-def test_a_stop_while_the_drive_is_searched_for_does_not_end_in_motion() -> None:
+def test_stop_while_the_drive_is_searched_for_does_not_end_in_motion() -> None:
     asked = round(DRIVE_START_SAMPLE + 2200) // 20
     recording = run(setup(), stopped_early, orders=partial(order, "stop", asked))
     assert recording.event_texts("motion")
@@ -85,7 +85,7 @@ class Early(Before):
         super().__init__(rig, specimen, rate_hz, clock, file_m, -9000.4, ppm)
 
 
-def test_a_controller_that_plays_before_the_start_is_refused() -> None:
+def test_controller_that_plays_before_the_start_is_refused() -> None:
     with pytest.raises(InputError) as error:
         run(setup(), kind=Early)
     assert error.value.key == "drive_disp_m"
@@ -101,7 +101,7 @@ class Lost(Bystander):
         return volts
 
 
-def test_a_lost_command_is_not_said_to_be_no_motion() -> None:
+def test_lost_command_is_not_taken_for_rest() -> None:
     text = (
         find_config("follow_simulated", "rigs")
         .read_text()
@@ -112,7 +112,7 @@ def test_a_lost_command_is_not_said_to_be_no_motion() -> None:
     assert "the command was lost, so it is not known" in recording.stop.reason
 
 
-def test_half_the_amplitude_is_told_where_no_command_is_wired() -> None:
+def test_half_the_amplitude_aborts_without_a_wired_command() -> None:
     def half(drive: Drive) -> Float1D:
         return 0.5 * whole(drive)
 

@@ -43,7 +43,7 @@ def shaketwin(*words: object, folder: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_a_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Path) -> None:
+def test_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Path) -> None:
     (tmp_path / "short.toml").write_text(PROFILE)
     with own_network():
         made = shaketwin("drive", "short.toml", *FOLLOWED, "-o", "drive.csv", folder=tmp_path)
@@ -91,7 +91,7 @@ def test_only_a_followed_table_is_played_by_somebody_else() -> None:
     assert error.value.where == f"--play {play}"
 
 
-def test_a_run_without_the_device_says_how_to_start_one(tmp_path: Path) -> None:
+def test_run_without_device_is_refused(tmp_path: Path) -> None:
     (tmp_path / "short.toml").write_text(PROFILE)
     with own_network():
         ran = shaketwin("run", "short.toml", *FOLLOWED, "--out", "run", folder=tmp_path)

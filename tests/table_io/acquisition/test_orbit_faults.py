@@ -104,7 +104,7 @@ def test_samples_that_come_late_do_not_lose_the_orbit(fault_s: float) -> None:
     assert np.ptp(result.mass_m[steady]) == pytest.approx(np.ptp(undisturbed[steady]), rel=0.05)
 
 
-def test_machine_that_falls_silent_halts_the_test_and_what_came_is_kept() -> None:
+def test_silent_machine_halts_the_test() -> None:
     result = run(make_profile(), HELD_S + 20.0, make_rig("stall", HELD_S))
     (stop,) = result.select(RunStop)
     assert stop.verdict == "halted"
@@ -113,7 +113,7 @@ def test_machine_that_falls_silent_halts_the_test_and_what_came_is_kept() -> Non
 
 
 @pytest.mark.slow  # 5 s
-def test_queue_that_a_dead_rig_leaves_behind_ends_at_rest() -> None:
+def test_queue_of_a_dead_rig_ends_at_rest() -> None:
     """At every tenth block, from the capture to the releases at the first orbit."""
     profile, clock = make_profile(slice(1)), ManualClock()
     backend = open_backend(RIG, profile, clock)

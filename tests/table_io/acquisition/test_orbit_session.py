@@ -125,7 +125,7 @@ def test_unstable_orbits_are_held_without_feedback_left(held: Run) -> None:
     assert held.select(RunStop)[0].verdict == "complete"
 
 
-def test_the_latency_of_the_feedback_is_stated(held: Run) -> None:
+def test_latency_of_the_feedback_is_stated(held: Run) -> None:
     (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
     measured_ms = float(event.text.split()[3])
     assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
@@ -290,7 +290,7 @@ def test_nominal_drive_holds_the_first_orbit() -> None:
     assert replace(drive.steps[1]) == profile.steps[1]
 
 
-def test_a_model_that_departs_too_far_ends_the_test_at_its_first_orbit() -> None:
+def test_model_that_departs_too_far_ends_the_test_at_its_first_orbit() -> None:
     """The plan's orbit has twice the amplitude of the specimen's."""
     orbit = PLAN["points"][0]
     doubled = orbit | {"u_m": (2.0 * np.array(orbit["u_m"])).tolist()}

@@ -46,7 +46,7 @@ def play(queue: OutputQueue, subject: Machine, until: int) -> None:
         queue.feed()
 
 
-def test_a_queue_that_never_started_has_nothing_to_bring_to_rest() -> None:
+def test_queue_that_never_started_has_nothing_to_bring_to_rest() -> None:
     subject = machine()
     queue = OutputQueue(subject, subject.clock, RIG.output, subject.drive, BLOCK_SAMPLES)
     assert queue.played_samples() == 0
@@ -56,7 +56,7 @@ def test_a_queue_that_never_started_has_nothing_to_bring_to_rest() -> None:
     assert (subject.next, subject.clock.now()) == (0, 0.0)
 
 
-def test_a_drive_is_replaced_at_once_or_nothing_changes() -> None:
+def test_drive_is_replaced_at_once_or_nothing_changes() -> None:
     subject = Hasty(plan_sweep(profile()), ManualClock(), after=4000)
     queue = start_queue(subject)
     play(queue, subject, 4000)
@@ -93,7 +93,7 @@ def test_nothing_is_replaced_once_the_lead_has_run_out() -> None:
     assert queue.drive.decay_start == end
 
 
-def test_a_tuned_test_plays_every_drive_that_was_decided_on() -> None:
+def test_tuned_test_plays_every_drive_that_was_decided_on() -> None:
     """Loop check and amplitude control change the drive on the way; each change is queued."""
     test = profile(stop_hz=2.5, directions=("forward",))
     defaults = type(test).model_fields
@@ -182,7 +182,7 @@ def assert_queued(device: Device, first: int, drive: Drive) -> None:
 
 @pytest.mark.parametrize("replace_after", [0, 40])
 @pytest.mark.parametrize(("rate_hz", "block"), [(800.0, 40), (1100.0, 7)])
-def test_the_queue_is_filled_to_twice_the_lead_whenever_less_than_the_lead_is_left(
+def test_queue_is_filled_to_twice_the_lead_whenever_less_than_the_lead_is_left(
     rate_hz: float, block: int, replace_after: int
 ) -> None:
     device = Device(rate_hz, replace_after)
@@ -210,7 +210,7 @@ def test_the_queue_is_filled_to_twice_the_lead_whenever_less_than_the_lead_is_le
 
 @pytest.mark.parametrize("rate_hz", [500.0, 900.0, 1100.0, 2000.0])
 @pytest.mark.parametrize("replace_after", [0, 33])
-def test_a_sample_is_played_at_its_time_and_decisions_take_five_milliseconds(
+def test_sample_is_played_at_its_time_and_decisions_take_five_milliseconds(
     rate_hz: float, replace_after: int
 ) -> None:
     device = Device(rate_hz, replace_after)
@@ -228,7 +228,7 @@ def test_a_sample_is_played_at_its_time_and_decisions_take_five_milliseconds(
 
 
 @pytest.mark.parametrize("refusals", range(8))
-def test_a_decay_is_tried_five_times_then_that_behind_the_lead_plays(refusals: int) -> None:
+def test_decay_is_tried_five_times_then_that_behind_the_lead_plays(refusals: int) -> None:
     device = Device()
     queue = make_queue(device)
     queue.start()
@@ -248,7 +248,7 @@ def test_a_decay_is_tried_five_times_then_that_behind_the_lead_plays(refusals: i
 
 
 @pytest.mark.parametrize("past", [-2, -1, 0, 1, 300])
-def test_a_decay_after_the_last_changeable_sample_changes_nothing(past: int) -> None:
+def test_decay_after_the_last_changeable_sample_changes_nothing(past: int) -> None:
     device = Device()
     queue = make_queue(device)
     rest_start = queue.drive.rest_start
@@ -285,7 +285,7 @@ def test_rest_is_awaited_in_pieces_of_200_samples(left: int, is_lost: bool) -> N
 
 
 @pytest.mark.parametrize("until", [3000, 5000])
-def test_what_still_moves_decays_at_once_to_be_at_rest(until: int) -> None:
+def test_bring_to_rest_decays_at_once(until: int) -> None:
     device = Device()
     queue = make_queue(device)
     queue.start()
@@ -298,7 +298,7 @@ def test_what_still_moves_decays_at_once_to_be_at_rest(until: int) -> None:
 
 @pytest.mark.parametrize("first", [2000, 3999, 4000, 4001, 9000])
 @pytest.mark.parametrize("is_whole", [False, True])
-def test_a_changed_drive_is_queued_from_its_first_change(first: int, is_whole: bool) -> None:
+def test_changed_drive_is_queued_from_its_first_change(first: int, is_whole: bool) -> None:
     """Behind the whole drive the machine rests, so that even a later change needs no filling."""
     device = Device()
     queue = make_queue(device)
@@ -312,7 +312,7 @@ def test_a_changed_drive_is_queued_from_its_first_change(first: int, is_whole: b
 
 @pytest.mark.parametrize("past", [-1, 0, 1])
 @pytest.mark.parametrize("held_s", [3.9, 4.0, 9.0])
-def test_only_a_change_of_what_still_moves_is_transferred(past: int, held_s: float) -> None:
+def test_change_behind_the_motion_is_not_transferred(past: int, held_s: float) -> None:
     device = Device()
     queue = make_queue(device)
     rest_start = queue.drive.rest_start
@@ -331,7 +331,7 @@ def test_only_a_change_of_what_still_moves_is_transferred(past: int, held_s: flo
         assert_queued(device, rest_start + past, last)
 
 
-def test_a_drive_that_is_queued_whole_never_runs_out() -> None:
+def test_drive_that_is_queued_whole_never_runs_out() -> None:
     device = Device()
     queue = make_queue(device)
     queue.start()
@@ -342,7 +342,7 @@ def test_a_drive_that_is_queued_whole_never_runs_out() -> None:
     assert not queue.is_decaying
 
 
-def test_a_refusal_before_the_start_is_a_fault() -> None:
+def test_refusal_before_the_start_is_a_fault() -> None:
     device = Device(refusals=3)
     queue = make_queue(device)
     with pytest.raises(ValueError, match="already"):
@@ -353,7 +353,7 @@ def test_a_refusal_before_the_start_is_a_fault() -> None:
 
 
 @pytest.mark.parametrize("lag_s", [0.0, 0.25])
-def test_a_refused_feed_plays_the_decay_behind_the_lead(lag_s: float) -> None:
+def test_refused_feed_plays_the_decay_behind_the_lead(lag_s: float) -> None:
     device = Device()
     queue = make_queue(device)
     queue.start()

@@ -35,7 +35,7 @@ def profile(first: int | None = None, **more: Any) -> Profile:
 
 
 @pytest.mark.parametrize("control", [True, False])
-def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> None:
+def test_resumed_test_starts_at_its_step_after_a_loop_check(control: bool) -> None:
     test = profile(3)
     test = test.model_copy(update={"control": test.control.model_copy(update={"enabled": control})})
     drive = nominal_drive(make_test_plan(test, RIG))
@@ -49,13 +49,13 @@ def test_it_goes_on_from_rest_at_its_step_after_a_loop_check(control: bool) -> N
     assert (first.level0, first.f1) == (0.0, 4.0)
 
 
-def test_without_a_loop_check_it_goes_on_at_its_step_too() -> None:
+def test_resumed_test_without_loop_check() -> None:
     none = profile().loop_check.model_copy(update={"enabled": False})
     drive = nominal_drive(make_test_plan(profile(4, loop_check=none), RIG))
     assert {segment.step for segment in sine_segments(drive)} == {4, 5}
 
 
-def test_its_plan_and_its_margins_are_those_of_what_is_driven() -> None:
+def test_demands_of_a_resumed_test() -> None:
     resumed = profile(4)
     assert {segment.step for segment in sine_segments(plan_sweep(resumed))} == {4, 5}
     rows, whole = (
@@ -69,7 +69,7 @@ def test_its_plan_and_its_margins_are_those_of_what_is_driven() -> None:
     assert rows[4].displacement_m > 0
 
 
-def test_nothing_is_resumed_where_nothing_was_interrupted() -> None:
+def test_resume_at_step_0_is_the_whole_test() -> None:
     assert profile().first_step == 0
     assert nominal_drive(make_test_plan(profile(0), RIG)) == nominal_drive(
         make_test_plan(profile(), RIG)
@@ -80,7 +80,7 @@ def test_nothing_is_resumed_where_nothing_was_interrupted() -> None:
     ("first", "key", "value", "allowed"),
     [(6, "resume", None, "0 to 5"), (-1, "resume.first_step", -1, "")],
 )
-def test_a_step_that_is_not_there_is_refused(
+def test_step_that_is_not_there_is_refused(
     first: int, key: str, value: int | None, allowed: str
 ) -> None:
     with pytest.raises(InputError) as error:

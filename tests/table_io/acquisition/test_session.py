@@ -220,7 +220,7 @@ class Watched(SimulatedBackend):
 
 
 @pytest.mark.parametrize("block_samples", [7, 20, 500])
-def test_a_complete_run_hands_out_every_sample_once_and_in_order(block_samples: int) -> None:
+def test_complete_run_hands_out_every_sample_once_and_in_order(block_samples: int) -> None:
     subject = machine()
     items = list(session(subject, Stop(), block_samples=block_samples))
     assert isinstance(items[0], RunStart)
@@ -241,7 +241,7 @@ def test_a_complete_run_hands_out_every_sample_once_and_in_order(block_samples: 
     )
 
 
-def test_the_machine_is_used_in_the_order_of_its_contract() -> None:
+def test_machine_is_used_in_the_order_of_its_contract() -> None:
     subject = machine()
     list(session(subject, Stop()))
     assert subject.calls[:4] == ["open", "tare", "queue", "start"]
@@ -249,7 +249,7 @@ def test_the_machine_is_used_in_the_order_of_its_contract() -> None:
     assert subject.calls.count("close") == subject.calls.count("start") == 1
 
 
-def test_the_tare_is_taken_off_and_told() -> None:
+def test_tare_is_subtracted_and_recorded() -> None:
     items = list(session(Watched(profile()), Stop()))
     start = items[0]
     assert isinstance(start, RunStart)
@@ -272,7 +272,7 @@ def test_lateness_is_counted_once_a_block() -> None:
 
 
 @pytest.mark.parametrize("after", [1, 30, 60, 100, 155, 300, 461, 700, 1000])
-def test_a_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) -> None:
+def test_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) -> None:
     subject = machine()
     items = list(session(subject, Stop(after)))
     decided = after * 20 - 1  # the newest sample when the stop was asked for
@@ -298,7 +298,7 @@ def test_a_stop_changes_the_command_within_50_ms_and_ends_at_rest(after: int) ->
     assert stop.index - subject.moved_until >= 0.2 * RATE_HZ
 
 
-def test_a_stop_is_labelled_from_its_first_sample_to_its_rest() -> None:
+def test_stop_is_labelled_from_its_first_sample_to_its_rest() -> None:
     subject = machine()
     whole = join_blocks(blocks(list(session(subject, Stop(300)))))
     stopping = np.flatnonzero(whole.label == Label.STOP)
@@ -310,7 +310,7 @@ def test_a_stop_is_labelled_from_its_first_sample_to_its_rest() -> None:
     assert not (whole.label[stopping[0] :] == Label.MEASURE).any()
 
 
-def test_a_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_can() -> None:
+def test_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_can() -> None:
     late = 1500  # 0.75 s, longer than the lead of the card
     subject = machine(replace_after=late)
     list(session(subject, Stop(300)))
@@ -318,7 +318,7 @@ def test_a_machine_that_cannot_be_changed_soon_is_fed_and_stopped_as_soon_as_it_
     assert subject.command[-1] == 0.0
 
 
-def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:
+def test_stroke_trip_states_sample_and_value() -> None:
     subject = machine(faults=dict.fromkeys([("table_disp_m", 5007 + k) for k in range(5)], 0.0655))
     items = list(session(subject, Stop()))
     stop = stop_record(items)
@@ -334,13 +334,13 @@ def test_a_stroke_trip_aborts_and_says_sample_and_value() -> None:
     assert subject.changed_samples[0] - known <= ALLOWED_DECISION * RATE_HZ
 
 
-def test_a_trip_wins_over_a_stop_asked_for_in_the_same_block() -> None:
+def test_trip_wins_over_a_stop_asked_for_in_the_same_block() -> None:
     faults = dict.fromkeys([("table_disp_m", 2000 + k) for k in range(5)], 0.07)
     assert stop_record(list(session(machine(faults=faults), Stop(101)))).verdict == "aborted"
 
 
 @pytest.mark.parametrize("items_taken", [1, 2, 40, 80, 300, 500, 900, 1110])
-def test_a_consumer_that_dies_leaves_a_table_at_rest(items_taken: int) -> None:
+def test_consumer_that_dies_leaves_a_table_at_rest(items_taken: int) -> None:
     subject = machine()
     source = session(subject, Stop())
     for _ in range(items_taken):
@@ -354,7 +354,7 @@ def test_a_consumer_that_dies_leaves_a_table_at_rest(items_taken: int) -> None:
         assert subject.moved_until <= asked + ALLOWED_DECISION * RATE_HZ + 1.2 * RATE_HZ
 
 
-def test_an_interrupt_in_the_consumer_brings_the_table_to_rest() -> None:
+def test_interrupt_in_the_consumer_brings_the_table_to_rest() -> None:
     subject = machine()
     source = session(subject, Stop())
     for _ in range(300):
@@ -367,7 +367,7 @@ def test_an_interrupt_in_the_consumer_brings_the_table_to_rest() -> None:
 
 @pytest.mark.parametrize("fails_at", [0, 500, 2100, 5990, 20_000])
 @pytest.mark.parametrize("deaf", [False, True])
-def test_a_machine_that_stops_answering_plays_its_tail_and_is_released(
+def test_machine_that_stops_answering_plays_its_tail_and_is_released(
     fails_at: int, deaf: bool
 ) -> None:
     subject = machine(fails_at=fails_at, deaf=deaf)
@@ -395,7 +395,7 @@ class Hasty(Machine):
         super().queue(index, volts)
 
 
-def test_a_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
+def test_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
     # After block 310 nothing is fed until the stop, so that the stop's own queue is refused.
     subject = Hasty(plan_sweep(profile()), ManualClock(), refused=3, after=6180)
     items = list(session(subject, Stop(310)))
@@ -406,7 +406,7 @@ def test_a_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
 
 
 @pytest.mark.parametrize("after", [2000, 6000, 9000])
-def test_a_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None:
+def test_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None:
     subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
     items = list(session(subject, Stop()))
     stop = stop_record(items)
@@ -428,7 +428,7 @@ def test_a_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> No
     assert stop.index >= subject.moved_until
 
 
-def test_a_failing_operator_link_ends_in_rest_too() -> None:
+def test_failing_operator_link_ends_in_rest_too() -> None:
     subject = machine()
 
     def commands() -> OperatorCommand | None:
@@ -443,7 +443,7 @@ def test_a_failing_operator_link_ends_in_rest_too() -> None:
 
 
 @pytest.mark.parametrize("call", ["open", "tare", "queue", "start"])
-def test_a_machine_that_fails_before_it_moves_is_released_and_never_moves(call: str) -> None:
+def test_machine_that_fails_before_it_moves_is_released_and_never_moves(call: str) -> None:
     subject = machine()
 
     def fail(*_: object) -> None:

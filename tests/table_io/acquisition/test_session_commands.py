@@ -111,7 +111,7 @@ def assert_ends_after_rest(items: list[Block | Record], subject: Machine) -> Non
 
 @given(name=st.sampled_from(sorted(VERDICTS)), after=st.integers(1, BLOCK_COUNT))
 @LAW
-def test_a_stop_and_an_abort_are_recorded_as_what_they_are(name: str, after: int) -> None:
+def test_stop_and_abort_are_recorded(name: str, after: int) -> None:
     items = give({after: name})
     stop = stop_record(items)
     assert (stop.verdict, stop.reason) == (VERDICTS[name], f"ordered {name} after {after}")
@@ -127,7 +127,7 @@ def test_a_stop_and_an_abort_are_recorded_as_what_they_are(name: str, after: int
     after=st.integers(FIRST_MOVING, BLOCK_COUNT - 1),
 )
 @LAW
-def test_the_first_end_that_was_ordered_counts(first: str, others: list[str], after: int) -> None:
+def test_first_end_that_was_ordered_counts(first: str, others: list[str], after: int) -> None:
     items = give({after: first} | {after + 1 + k: name for k, name in enumerate(others)})
     assert stop_record(items).verdict == VERDICTS[first]
     assert len(events(items, "stop")) == 1
@@ -158,7 +158,7 @@ def test_no_session_ends_before_its_queue_has_run_out(
 
 @given(after=st.integers(FIRST_MOVING + 10, 900), wait=st.integers(50, 80))
 @LAW
-def test_an_order_takes_effect_with_its_lead(after: int, wait: int, changes: Changes) -> None:
+def test_order_takes_effect_with_its_lead(after: int, wait: int, changes: Changes) -> None:
     changes.made.clear()
     subject = machine()
     items = give({after: "hold", after + wait: "resume"}, subject)
@@ -186,7 +186,7 @@ def test_an_order_takes_effect_with_its_lead(after: int, wait: int, changes: Cha
      ({300: "hold", 350: "hold", 400: "resume"}, ["hold in 'holding'"]),
      ({300: "hold", 350: "resume", 351: "resume"}, ["resume in 'running'"])],
 )  # fmt: skip
-def test_an_order_out_of_place_is_refused_and_changes_nothing(
+def test_order_out_of_place_is_refused_and_changes_nothing(
     orders: dict[int, str], refused: list[str], changes: Changes
 ) -> None:
     items = give(orders)
@@ -197,7 +197,7 @@ def test_an_order_out_of_place_is_refused_and_changes_nothing(
     assert stop_record(items).verdict == "complete"
 
 
-def test_a_trip_during_a_decay_is_no_second_stop() -> None:
+def test_trip_during_a_decay_is_no_second_stop() -> None:
     faults = dict.fromkeys([("table_disp_m", 6020 + k) for k in range(5)], 0.07)
     items = give({300: "stop"}, machine(faults=faults))
     assert stop_record(items).verdict == "stopped"
@@ -217,7 +217,7 @@ class Mute(Machine):
 
 
 @pytest.mark.parametrize("lost_at", [0, 3000, 5007])
-def test_a_lost_machine_halts_the_test_when_its_queue_has_run_out(lost_at: int) -> None:
+def test_lost_machine_halts_the_test_when_its_queue_has_run_out(lost_at: int) -> None:
     subject = Mute(plan_sweep(profile()), ManualClock(), lost_at=lost_at)
     items: list[Block | Record] = []
     for item in session(subject, Stop()):
@@ -267,7 +267,7 @@ def test_late_blocks_are_reported_once_a_series(
     assert stop_record(items).verdict == "complete"
 
 
-def test_a_feedback_that_comes_too_late_every_time_ends_the_test(
+def test_feedback_that_comes_too_late_every_time_ends_the_test(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Each try answers from a later sample on, by one block; the last one is the last."""
@@ -316,7 +316,7 @@ class Taring(Machine):
         return volts
 
 
-def test_the_tare_is_that_of_one_second_at_rest() -> None:
+def test_tare_is_that_of_one_second_at_rest() -> None:
     subject = Taring(plan_sweep(profile()), ManualClock())
     list(session(subject, Stop(2)))
     assert subject.tared == [RATE_HZ]
@@ -368,7 +368,7 @@ def test_gaps_are_the_runs_of_every_channel(density: float, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_first_late_block_of_each_series_is_an_event(seed: int) -> None:
+def test_first_late_block_of_each_series_is_an_event(seed: int) -> None:
     draw = np.random.default_rng(seed)
     lateness = draw.choice([0.0, 0.09, MAX_LATENESS_S, 0.101, 0.5], 60).tolist()
     index = iter(range(1000, 2000))
@@ -398,7 +398,7 @@ def test_the_first_late_block_of_each_series_is_an_event(seed: int) -> None:
 
 
 @pytest.mark.parametrize("after", [2000, 6000])
-def test_an_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> None:
+def test_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> None:
     subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
     refused_after = 0
     items = []
@@ -413,7 +413,7 @@ def test_an_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> N
     assert stop_record(items).states[-2:] == ("stopping", "at rest")
 
 
-def test_a_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
+def test_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     answer = procedure.answer_block

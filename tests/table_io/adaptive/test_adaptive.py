@@ -15,10 +15,9 @@ from table_io.adaptive.policy import describe_adaptive_test, make_policy
 from table_io.adaptive.resonance_tracking import interpolate_phase_crossing, parabola_vertex
 from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Block, Float1D, Label
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
 from table_io.control.order_tracking import HARMONIC_COUNT, NO_FIT, HarmonicFit
-from table_io.errors import InputError
 from table_io.records import Event, Record, Step, StepAdded
 from table_io.sequencer.procedure import (
     advance_test,
@@ -178,7 +177,7 @@ def test_by_peak_the_maximum_of_u_is_found_below_it(level: float) -> None:
 
 @pytest.mark.parametrize("by", ["phase", "peak"])
 @pytest.mark.parametrize("direction", ["forward", "backward"])
-def test_a_resonance_that_moves_is_followed(by: str, direction: str) -> None:
+def test_resonance_that_moves_is_followed(by: str, direction: str) -> None:
     """The damper warms up: 1 % of its frequency over 30 visits."""
     played_steps = itertools.count()
 
@@ -210,7 +209,7 @@ def upper(f: float) -> complex:
     return cmath.rect(size, math.radians(phase))
 
 
-def test_a_branch_that_turns_back_is_followed_to_its_phase_without_a_fall() -> None:
+def test_branch_that_turns_back_is_followed_to_its_phase_without_a_fall() -> None:
     """What a Newton step over frequency would overshoot: the branch ends 0.027 Hz further on."""
     fallen = []
 
@@ -226,7 +225,7 @@ def test_a_branch_that_turns_back_is_followed_to_its_phase_without_a_fall() -> N
     assert at(outcome.conclusion) == pytest.approx(FOLD_HZ - 0.0272 * (15.0 / 15.3) ** 2, abs=0.004)
 
 
-def test_a_fall_off_the_branch_ends_the_search_and_is_said() -> None:
+def test_fall_off_the_branch_ends_the_search() -> None:
     card = tracking("phase", phase_deg=70.0, step_hz=0.03, resolution_hz=0.004)
     sweep = {"start_hz": 3.0, "stop_hz": 4.4, "step_hz": 0.1}
     outcome = play_policy(
@@ -259,7 +258,7 @@ def test_no_visit_moves_by_more_than_the_step(by: str) -> None:
     assert at(outcome.conclusion) == pytest.approx(1.25 if by == "phase" else 1.231, abs=0.003)
 
 
-def test_the_range_is_kept_and_the_visits_are_counted() -> None:
+def test_range_is_kept_and_the_visits_are_counted() -> None:
     test = profile("track", tracking("phase", lowest_hz=1.0, highest_hz=1.25))
     outcome = play_policy(test, lambda step: result(step, linear(step.frequency_hz)))
     assert "was not met" in outcome.conclusion
@@ -282,14 +281,14 @@ def test_the_range_is_kept_and_the_visits_are_counted() -> None:
 
 
 @pytest.mark.parametrize("tool, card", [("track", tracking("peak")), ("refine", None)])
-def test_without_u_there_is_nothing_to_go_by(tool: str, card: dict[str, Any] | None) -> None:
+def test_adaptive_test_without_u_ends(tool: str, card: dict[str, Any] | None) -> None:
     test = profile(tool, card or {"resolution_hz": 0.02, "cycles": 100})
     outcome = play_policy(test, lambda step: result(step, complex("nan"), math.nan))
     assert "was not measured at 1 Hz" in outcome.conclusion
     assert not outcome.visits
 
 
-def test_a_phase_near_180_degrees_does_not_flip_its_sign() -> None:
+def test_phase_near_180_degrees_does_not_flip_its_sign() -> None:
     """Far below a resonance u lies against A: noise makes it 179 or 181, never -179."""
     step = Step(0, "forward", 0.5, A)
     for phase in (179.0, 181.0, 90.0, 0.0, -5.0):
@@ -297,7 +296,7 @@ def test_a_phase_near_180_degrees_does_not_flip_its_sign() -> None:
         assert result(step, u).phase_deg == pytest.approx(phase, abs=1e-9)
 
 
-def test_a_crossing_is_interpolated_over_the_phase() -> None:
+def test_crossing_is_interpolated_over_the_phase() -> None:
     fold = [(4.0 - 0.001 * (p - 75.0) ** 2, p) for p in (110.0, 100.0, 95.0)]
     assert interpolate_phase_crossing(fold, 90.0, 0.01) == pytest.approx(
         4.0 - 0.001 * 15.0**2, abs=1e-9
@@ -313,7 +312,7 @@ def test_a_crossing_is_interpolated_over_the_phase() -> None:
     assert interpolate_phase_crossing(line[:1], 90.0, 0.01) is None
 
 
-def test_a_summit_is_that_of_the_parabola() -> None:
+def test_summit_is_that_of_the_parabola() -> None:
     def y(x: float) -> float:
         return 3.0 - 2.0 * (x - 1.23) ** 2
 
@@ -429,7 +428,7 @@ def test_approach_hz_shortens_the_way_and_one_inside_the_hysteresis_is_found_out
     assert {step.frequency_hz for step in lost.visits} == {3.4}
 
 
-def test_a_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held() -> None:
+def test_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held() -> None:
     """Slow passage: it leaves two visits after it was due, so the sweep finds it too far on."""
     forward = WIDE | {"directions": ["forward"]}
     specimen = Bistable(2.7912, 3.89, late=2)
@@ -444,7 +443,7 @@ def test_a_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held(
     assert "20 held cycles" in long.conclusion
 
 
-def test_a_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
+def test_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
     """The first visit after the fold is passed finds the motion half way down."""
     specimen, before = Bistable(2.7912, 4.0274), []
 
@@ -462,7 +461,7 @@ def test_a_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
     assert good <= 4.0274 <= bad <= good + 0.0125 + 1e-9
 
 
-def test_a_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
+def test_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
     """What was good before is no longer: the interval moves back with it."""
     specimen = Bistable(2.7912, 4.0274)
 
@@ -481,7 +480,7 @@ def test_a_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
 
 
 @pytest.mark.parametrize("cycles", [5, 60, 150, 400])
-def test_the_cycles_allowed_are_never_exceeded(cycles: int) -> None:
+def test_cycles_allowed_are_never_exceeded(cycles: int) -> None:
     test = profile("refine", refining(cycles=cycles, resolution_hz=0.002), **WIDE)
     outcome = play_policy(test, Bistable(2.7912, 4.0274))
     assert 5 * len(outcome.visits) <= cycles
@@ -498,7 +497,7 @@ def test_without_a_jump_there_is_nothing_to_refine() -> None:
     assert len(outcome.results) == 7
 
 
-def test_a_steep_change_is_not_taken_for_a_jump() -> None:
+def test_steep_change_is_not_taken_for_a_jump() -> None:
     def steep(step: Step) -> StepResult:
         return result(step, 5e-3 * math.exp(-6.0 * (step.frequency_hz - 3.0)) + 0j)
 
@@ -507,7 +506,7 @@ def test_a_steep_change_is_not_taken_for_a_jump() -> None:
 
 
 @pytest.mark.parametrize("parts", [2, 8, 20])
-def test_the_worst_case_needs_the_fewest_visits(parts: int) -> None:
+def test_worst_case_needs_the_fewest_visits(parts: int) -> None:
     """Against a search over all strategies; halves where the way back is free, else it creeps."""
 
     def worst(n: int, hold: int, back: int) -> int:
@@ -529,7 +528,7 @@ def test_the_worst_case_needs_the_fewest_visits(parts: int) -> None:
 # Swing
 
 
-def test_a_swing_is_the_mean_over_whole_cycles() -> None:
+def test_swing_is_the_mean_over_whole_cycles() -> None:
     phase = 7.3 + np.arange(1201) * 3.0 / 1200
     size = np.floor(phase - phase[0] + 1e-9).clip(0, 2) + 1.0
     assert mean_swing(size * np.sin(2 * math.pi * phase), phase) == pytest.approx(2.0, rel=1e-3)
@@ -571,7 +570,7 @@ def dwelling(**control: Any) -> Profile:
 
 
 @pytest.mark.parametrize("control", [True, False])
-def test_a_decided_step_is_announced_before_it_begins(control: bool) -> None:
+def test_decided_step_is_announced_before_it_begins(control: bool) -> None:
     table = Table(start_test(make_test_plan(dwelling(enabled=control), RIG, 40)))
     records = table.play(20)
     decided = [record for record in records if isinstance(record, StepAdded)]
@@ -596,7 +595,7 @@ def test_a_decided_step_is_announced_before_it_begins(control: bool) -> None:
 
 
 @pytest.mark.parametrize("after", [0, 2000])
-def test_a_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
+def test_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
     """Also between a decision and its step: the step before is then measured anew."""
     table = Table(start_test(make_test_plan(dwelling(enabled=False), RIG, 40)))
     records: list[Record] = []
@@ -618,57 +617,6 @@ def test_a_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
 # The cards
 
 
-TEST = (PROFILES_DIR / "tests" / "track.toml").read_text(encoding="utf-8").split("[track]")[0]
-
-
-TRACK = "[track]\nby = 'peak'\nresolution_hz = 0.01\n"
-REFINE = "[refine]\ncycles = 9\n"
-
-
-@pytest.mark.parametrize(
-    ("card", "key", "allowed"),
-    [
-        ("[dwell]", "dwell.seconds", ""),
-        ("[dwell]\ncycles = 5\nseconds = 3.0", "dwell.seconds", ""),
-        ("[track]\nby = 'phase'\nstep_hz = 0.05", "track.resolution_hz", ""),
-        (
-            "[track]\nby = 'phase'\nstep_hz = 0.05\nresolution_hz = 0.04",
-            "track.resolution_hz",
-            "at most 0.025",
-        ),
-        (TRACK + "step_hz = 0.05\nphase_deg = 90.0", "track.phase_deg", ""),
-        (TRACK + "step_hz = 0.05\nhighest_hz = 1.7", "track", "1 to 1.6"),
-        (TRACK + "step_hz = 0.4", "track", "a range of at least two steps"),
-        (REFINE + "resolution_hz = 0.1", "refine", "0.000781 to below 0.1"),
-        (REFINE + "resolution_hz = 0.01\napproach_hz = 0.9", "refine", "1 to 1.6"),
-        (
-            "[dwell]\ncycles = 5\n" + REFINE + "resolution_hz = 0.01",
-            "refine",
-            "one of dwell, track, refine",
-        ),
-    ],
-)
-def test_a_card_that_does_not_fit_is_refused(card: str, key: str, allowed: str) -> None:
-    with pytest.raises(InputError) as caught:
-        parse_toml(TEST + card, Profile, "some/test.toml")
-    (fault,) = caught.value.faults
-    assert (fault.key, fault.allowed) == (key, allowed)
-
-
-def test_one_frequency_leaves_nothing_to_track_or_to_refine() -> None:
-    single = TEST.replace("stop_hz = 1.6", "stop_hz = 1.0")
-    for card, key in (
-        (TRACK + "step_hz = 0.05", "track"),
-        (REFINE + "resolution_hz = 0.01", "refine"),
-    ):
-        with pytest.raises(InputError) as caught:
-            parse_toml(single + card, Profile, "some/test.toml")
-        (fault,) = caught.value.faults
-        assert fault.key == key
-        assert "stop_hz" in fault.remedy
-    assert parse_toml(single + "[dwell]\ncycles = 5", Profile, "some/test.toml").dwell is not None
-
-
 @pytest.mark.parametrize(
     "name, part",
     [
@@ -678,7 +626,7 @@ def test_one_frequency_leaves_nothing_to_track_or_to_refine() -> None:
         ("g4_ss3", ""),
     ],
 )
-def test_the_plan_of_a_shipped_test_in_words(name: str, part: str) -> None:
+def test_describe_adaptive_test(name: str, part: str) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test")[0]
     assert part in describe_adaptive_test(test)
     assert bool(describe_adaptive_test(test)) == bool(part) == (make_policy(test) is not None)

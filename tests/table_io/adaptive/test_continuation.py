@@ -59,7 +59,7 @@ def hold(
     return OrbitMeasurement(x, x, c, np.ones(2, dtype=np.complex128))
 
 
-def test_one_step_finds_the_orbit_of_a_linear_specimen() -> None:
+def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
     f, ratio = 3.4, linear_response(3.4, 200e3)
     jacobian = real_matrix(ratio)
     table = table_harmonics(f, A, 1)

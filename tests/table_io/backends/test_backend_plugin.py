@@ -114,7 +114,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow  # 10 s
 @pytest.mark.usefixtures("drafts")
-def test_the_example_is_checked_runs_and_is_replayed_without_its_package(lab: Path) -> None:
+def test_example_is_checked_runs_and_is_replayed_without_its_package(lab: Path) -> None:
     site = lab / "site"
     table = ("two.toml", "--table", "rig.toml")
     code, text = shaketwin(lab, "check", *table, "--out", "checked", site=site)
@@ -142,7 +142,7 @@ def test_without_the_package_every_command_refuses_the_rig_file(lab: Path) -> No
     assert not (lab / "none").exists()
 
 
-def test_a_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path: Path) -> None:
+def test_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(RIG)
     with pytest.raises(InputError) as caught:
@@ -159,7 +159,7 @@ def test_a_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path:
     assert (caught.value.key, caught.value.value) == ("backend", "ideal")
 
 
-def test_the_section_of_a_plugin_is_read_as_strictly_as_ours(site: Path) -> None:
+def test_section_of_a_plugin_is_read_as_strictly_as_ours(site: Path) -> None:
     install(site)
     rig = parse_toml(RIG, RigConfig, "rig.toml")
     assert rig.runs_at_any_speed
@@ -175,9 +175,7 @@ def test_the_section_of_a_plugin_is_read_as_strictly_as_ours(site: Path) -> None
     assert [fault.key for fault in caught.value.faults] == ["ideal"]
 
 
-def test_what_only_acquires_does_not_drive_and_is_a_source_of_follow(
-    site: Path, tmp_path: Path
-) -> None:
+def test_source_does_not_drive(site: Path, tmp_path: Path) -> None:
     install(site, ACQUIRES)
     profile = parse_toml(PROFILE, Profile, "two.toml")
     rig = parse_toml(RIG.replace("gain = 1.0", ""), RigConfig, "rig.toml")
@@ -201,7 +199,7 @@ def test_what_only_acquires_does_not_drive_and_is_a_source_of_follow(
     assert not (tmp_path / "none").exists()
 
 
-def test_a_recording_that_followed_a_plugin_is_read_without_it(tmp_path: Path) -> None:
+def test_recording_that_followed_a_plugin_is_read_without_it(tmp_path: Path) -> None:
     followed = RIG.replace("gain = 1.0", '[follow]\nsource = "ideal"').replace(
         'backend = "ideal"', 'backend = "follow"'
     )
@@ -213,7 +211,7 @@ def test_a_recording_that_followed_a_plugin_is_read_without_it(tmp_path: Path) -
     assert (caught.value.key, caught.value.value) == ("[ideal]", "ideal")
 
 
-def test_a_source_that_drives_is_refused(site: Path) -> None:
+def test_source_that_drives_is_refused(site: Path) -> None:
     install(site)
     followed = RIG.replace("gain = 1.0", 'gain = 1.0\n[follow]\nsource = "ideal"').replace(
         'backend = "ideal"', 'backend = "follow"'
@@ -233,7 +231,7 @@ def test_a_source_that_drives_is_refused(site: Path) -> None:
         (MODULE.replace("open=IdealTable, ", ""), "a BackendDescriptor with open or open_source"),
     ],
 )
-def test_an_unusable_plugin_is_an_error_of_input(site: Path, module: str, allowed: str) -> None:
+def test_unusable_plugin_is_an_error_of_input(site: Path, module: str, allowed: str) -> None:
     install(site, module)
     with pytest.raises(InputError) as caught:
         find_descriptor(parse_toml(RIG, RigConfig, "rig.toml"))
@@ -267,14 +265,14 @@ def test_rig_files_are_read_without_any_vendor_library() -> None:
 
 
 @pytest.mark.parametrize("group", [BACKEND_GROUP, SIMULATOR_GROUP])
-def test_the_installed_metadata_are_those_of_the_source(group: str) -> None:
+def test_installed_metadata_are_those_of_the_source(group: str) -> None:
     """If this fails alone, install again: `pip install -e .`"""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     installed = metadata.distribution("shaketwin").entry_points.select(group=group)
     assert {entry.name: entry.value for entry in installed} == project["entry-points"][group]
 
 
-def test_every_backend_of_ours_opens_one_thing_and_says_what_it_serves() -> None:
+def test_shipped_backends_drive_or_acquire() -> None:
     profile, _ = load_config(PROFILES_DIR / "tests" / "quickstart.toml", Profile, "profile")
     served = set()
     for path in (PROFILES_DIR / "rigs").glob("*.toml"):

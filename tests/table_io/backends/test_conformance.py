@@ -291,6 +291,6 @@ def test_every_clause_has_its_violation() -> None:
         clause_or_kind if isinstance(clause_or_kind, str) else clause_or_kind.__name__
     ),
 )
-def test_a_broken_backend_is_seen(clause: str, kind: type[SimulatedBackend]) -> None:
+def test_clause_fails_for_a_broken_backend(clause: str, kind: type[SimulatedBackend]) -> None:
     with pytest.raises((AssertionError, OSError)):
         CLAUSES[clause](make_simulated_bench(ManualClock(), kind))

@@ -29,7 +29,7 @@ def following(clock: Clock, kind: type[Bystander] = Bystander) -> Bench:
 
 @pytest.mark.parametrize("clause", ACQUIRING)
 @pytest.mark.parametrize("clock", [ManualClock(), RealClock(2.0)], ids=["manual", "real"])
-def test_what_only_acquires_keeps_the_contract(clause: str, clock: Clock) -> None:
+def test_source_keeps_the_contract(clause: str, clock: Clock) -> None:
     ACQUIRING[clause](following(clock))
 
 
@@ -45,12 +45,12 @@ def test_what_only_acquires_keeps_the_contract(clause: str, clock: Clock) -> Non
         clause_or_kind if isinstance(clause_or_kind, str) else clause_or_kind.__name__
     ),
 )
-def test_a_broken_source_is_seen(clause: str, kind: type) -> None:
+def test_clause_fails_for_a_broken_source(clause: str, kind: type) -> None:
     broken = type(kind.__name__, (kind, Bystander), {"__init__": Bystander.__init__})
     with pytest.raises((AssertionError, OSError)):
         ACQUIRING[clause](following(ManualClock(), broken))
 
 
-def test_only_what_is_about_output_is_left_out() -> None:
+def test_omitted_clauses_queue_a_command() -> None:
     for name in CLAUSES.keys() - ACQUIRING.keys():
         assert "backend.queue(" in inspect.getsource(CLAUSES[name])

@@ -68,5 +68,5 @@ def bench(
 
 
 @pytest.mark.parametrize("clause", CLAUSES)
-def test_the_ni_backend_keeps_the_contract(clause: str, bench: Bench) -> None:
+def test_ni_backend_keeps_the_contract(clause: str, bench: Bench) -> None:
     CLAUSES[clause](bench)

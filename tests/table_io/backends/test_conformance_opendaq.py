@@ -76,7 +76,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
 
 
 @pytest.mark.parametrize("clause", ACQUIRING)
-def test_the_client_keeps_the_contract(clause: str, bench: Bench) -> None:
+def test_client_keeps_the_contract(clause: str, bench: Bench) -> None:
     ACQUIRING[clause](bench)
 
 
@@ -93,7 +93,7 @@ def replace_signals(rig: RigConfig, **signals: str) -> RigConfig:
     return rig.model_copy(update={"opendaq": wiring})
 
 
-def test_a_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
+def test_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
     source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="cell_9"), RATE_HZ, bench.clock)
     with pytest.raises(InputError) as error:
         source.open()
@@ -102,7 +102,7 @@ def test_a_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -
     source.close()
 
 
-def test_a_signal_without_time_stamps_is_refused(bench: Bench) -> None:
+def test_signal_without_time_stamps_is_refused(bench: Bench) -> None:
     source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="time"), RATE_HZ, bench.clock)
     with pytest.raises(InputError) as error:
         source.open()
@@ -118,7 +118,7 @@ def test_another_rate_than_the_devices_is_refused(bench: Bench) -> None:
     source.close()
 
 
-def test_who_does_not_answer_is_named(bench: Bench) -> None:
+def test_silent_device_is_named(bench: Bench) -> None:
     away = get_wiring(bench.rig).model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
     with pytest.raises(InputError, match="7499") as error:
         check_reachable(bench.rig.model_copy(update={"opendaq": away}))
@@ -151,7 +151,7 @@ def test_signals_in_the_cards_units_are_the_volts_of_its_sensors(tmp_path: Path)
         wrong.close()
 
 
-def test_a_device_that_dies_is_told(tmp_path: Path) -> None:
+def test_dead_device_is_a_lost_machine(tmp_path: Path) -> None:
     """Each time, and no sample is made up."""
     with own_network(), far_side(tmp_path) as bench:
         source = bench.start_playing(np.zeros(2))

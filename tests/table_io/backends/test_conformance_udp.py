@@ -33,5 +33,5 @@ def bench(
 
 
 @pytest.mark.parametrize("clause", CLAUSES)
-def test_a_udp_target_keeps_the_contract(clause: str, bench: Bench) -> None:
+def test_udp_target_keeps_the_contract(clause: str, bench: Bench) -> None:
     CLAUSES[clause](bench)

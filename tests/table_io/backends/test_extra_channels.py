@@ -55,7 +55,7 @@ def test_ni_needs_its_terminals() -> None:
     assert TEMPERATURE in caught.value.problem
 
 
-def test_a_udp_target_sends_it_in_the_order_of_the_sensors(tmp_path: Path) -> None:
+def test_udp_target_sends_it_in_the_order_of_the_sensors(tmp_path: Path) -> None:
     with python_target(tmp_path, DECLARED) as address:
         rig = parse_toml(card(address, DECLARED), RigConfig, "udp")
         read_at_rest(UdpBackend(rig, SPECIMEN, RATE_HZ, RealClock()))

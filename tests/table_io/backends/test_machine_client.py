@@ -90,7 +90,7 @@ def driving(where: str) -> MachineBackend:
     return backend
 
 
-def test_nobody_there_says_how_to_start_it(tmp_path: Path) -> None:
+def test_absent_machine_is_refused_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(InputError) as error:
         controller(f"unix/{tmp_path / 'none'}").open()
     assert START in error.value.remedy
@@ -99,7 +99,7 @@ def test_nobody_there_says_how_to_start_it(tmp_path: Path) -> None:
     assert START in error.value.remedy
 
 
-def test_asking_whether_it_is_there_claims_nothing(machine: Served) -> None:
+def test_check_reachable_claims_nothing(machine: Served) -> None:
     check_reachable(at(machine.where))
     backend = controller(machine.where)
     backend.open()
@@ -109,7 +109,7 @@ def test_asking_whether_it_is_there_claims_nothing(machine: Served) -> None:
     check_reachable(RIG.model_copy(update={"backend": "simulated"}))
 
 
-def test_what_is_no_machine_is_named() -> None:
+def test_other_server_is_refused() -> None:
     with closing(socket.create_server(("127.0.0.1", 0))) as mute:
         where = f"tcp/127.0.0.1:{mute.getsockname()[1]}"
         with pytest.raises(InputError) as error:
@@ -118,7 +118,7 @@ def test_what_is_no_machine_is_named() -> None:
     assert START in error.value.remedy
 
 
-def test_one_controller_at_a_time(machine: Served) -> None:
+def test_controller_at_a_time(machine: Served) -> None:
     first = driving(machine.where)
     with pytest.raises(InputError) as error:
         controller(machine.where).open()
@@ -127,7 +127,7 @@ def test_one_controller_at_a_time(machine: Served) -> None:
     first.close()
 
 
-def test_a_machine_that_is_switched_off_says_so_and_ends_at_rest(tmp_path: Path) -> None:
+def test_machine_that_is_switched_off_ends_at_rest(tmp_path: Path) -> None:
     box = FlightRecorder(tmp_path / "box", print)
     with serve_machine(parse_endpoint(f"unix/{tmp_path / 'table'}"), box) as table_server:
         backend = driving(table_server.where)
@@ -162,7 +162,7 @@ def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data:
     again.close()
 
 
-def test_what_has_come_is_handed_out_before_the_loss_is_told(machine: Served) -> None:
+def test_received_samples_are_read_before_the_loss(machine: Served) -> None:
     backend = driving(machine.where)
     while backend._samples.received < 200:
         backend._receive()
@@ -222,7 +222,7 @@ def test_samples_that_do_not_come_are_a_lost_machine(tmp_path: Path) -> None:
     listener.close()
 
 
-def test_an_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) -> None:
+def test_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) -> None:
     where = parse_endpoint(f"unix/{tmp_path / 'table'}")
     with closing(open_listener(where)), pytest.raises(InputError) as error:
         open_listener(where)
@@ -236,7 +236,7 @@ def test_an_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path)
 
 
 @pytest.mark.parametrize("key", ["machine", "simulated"])
-def test_a_card_without_its_table_is_refused(key: str) -> None:
+def test_card_without_its_table_is_refused(key: str) -> None:
     rig = RIG.model_copy(update={key: None})
     make: Callable[[], object] = (
         (lambda: MachineBackend(rig, SPECIMEN, RATE_HZ, RealClock()))

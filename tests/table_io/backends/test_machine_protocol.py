@@ -40,7 +40,7 @@ def test_messages_survive_any_cut(payloads: list[bytes], cut: int) -> None:
         HEADER.pack(b"STM2", MessageKind.BEAT, 0, 0),
     ],
 )
-def test_what_is_no_message_is_garbage_at_once(data: bytes) -> None:
+def test_invalid_message_is_refused_at_once(data: bytes) -> None:
     with pytest.raises(ProtocolError):
         MessageParser().feed(data)
 
@@ -51,7 +51,7 @@ def test_what_is_no_message_is_garbage_at_once(data: bytes) -> None:
         max_size=6,
     )
 )
-def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]) -> None:
+def test_buffer_holds_the_last_command(puts: list[tuple[int, list[float]]]) -> None:
     queued, plain = CommandBuffer(), np.zeros(200)
     for index, values in puts:
         queued.replace_from(index, np.array(values))
@@ -66,7 +66,7 @@ def test_what_is_queued_is_what_was_put_last(puts: list[tuple[int, list[float]]]
 
 @pytest.mark.parametrize("f", [0.5, 1.3, 4.0, 10.0])
 @pytest.mark.parametrize("turn", np.arange(8) / 8)
-def test_a_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
+def test_landing_goes_on_smoothly_and_ends_at_rest(f: float, turn: float) -> None:
     a = 0.4903
     t = turn / f + np.arange(-400, 1) / RATE_HZ
     motion = a / (2 * np.pi * f) ** 2 * np.sin(2 * np.pi * f * t)
@@ -86,7 +86,7 @@ SPAN_M = 0.06
     ("size_m", "f", "most"),  # times the acceleration of the motion, or 0.5 m/s2
     [(0.05, 0.8, 1.1), (0.05, 1.0, 1.1), (0.05, 1.5, 1.1), (0.012, 4.0, 1.1), (0.0599, 0.5, 1.2)],
 )
-def test_a_landing_from_a_large_motion_stays_within_the_span(
+def test_landing_from_a_large_motion_stays_within_the_span(
     size_m: float, f: float, most: float
 ) -> None:
     for turn in np.arange(32) / 32:
@@ -100,9 +100,7 @@ def test_a_landing_from_a_large_motion_stays_within_the_span(
 
 @pytest.mark.parametrize("x", [0.0599, 0.06, 0.07, -0.06])
 @pytest.mark.parametrize("v", [0.1, 3.0, -0.4])
-def test_what_cannot_keep_within_the_span_stops_dead_and_goes_home_gently(
-    x: float, v: float
-) -> None:
+def test_landing_beyond_the_span_stops_dead(x: float, v: float) -> None:
     landed = plan_stop(x + v / RATE_HZ * np.array([-2.0, -1.0, 0.0]), RATE_HZ, SPAN_M)
     assert np.abs(landed).max() <= max(abs(x), SPAN_M)
     assert landed[-1] == 0.0
@@ -111,7 +109,7 @@ def test_what_cannot_keep_within_the_span_stops_dead_and_goes_home_gently(
 
 
 @pytest.mark.parametrize("x", [1e100, 20.0])
-def test_no_number_leaves_a_landing_without_an_end(x: float) -> None:
+def test_landing_ends_for_any_number(x: float) -> None:
     landed = plan_stop(np.array([0.0, 0.0, x]), RATE_HZ, SPAN_M)
     assert np.abs(landed).max() <= x
     assert landed[-1] == 0.0
@@ -129,7 +127,7 @@ def test_no_number_leaves_a_landing_without_an_end(x: float) -> None:
         "unix/",
     ],
 )
-def test_an_endpoint_stays_on_this_computer(text: str) -> None:
+def test_endpoint_stays_on_this_computer(text: str) -> None:
     with pytest.raises(InputError) as error:
         parse_endpoint(text)
     assert (error.value.key, error.value.value) == ("endpoint", text)

@@ -43,7 +43,7 @@ def reads(backend: NiBackend, blocks: int) -> None:
 
 
 @pytest.mark.slow  # 20 s
-def test_a_server_that_stands_still_in_motion_holds_neither_read_nor_close(
+def test_stopped_server_blocks_neither_read_nor_close(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A dozen calls meet their deadline here, one after another.
@@ -81,7 +81,7 @@ def answers_and_opens(rig: RigConfig) -> None:
     NiBackend(rig, SPECIMEN, RATE_HZ, RealClock()).open()
 
 
-def test_the_heart_beats_before_the_start_so_that_a_latch_can_be_reset() -> None:
+def test_heart_beats_before_the_start_so_that_a_latch_can_be_reset() -> None:
     bed = Bed()
     times = note_heartbeats(bed)
     backend = bed.backend()
@@ -100,7 +100,7 @@ def test_the_heart_beats_before_the_start_so_that_a_latch_can_be_reset() -> None
 WELL = CARD.replace("inputs = [", 'well = { interlock = "Dev1/port0/line1" }\ninputs = [', 1)
 
 
-def test_an_open_interlock_is_not_started_against(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_open_interlock_is_not_started_against(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed(WELL)
     monkeypatch.setattr(
         bed.service,
@@ -129,7 +129,7 @@ def test_with_all_well_it_starts() -> None:
     backend.close()
 
 
-def test_a_start_whose_answer_is_lost_is_played_to_rest(
+def test_start_whose_answer_is_lost_is_played_to_rest(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     bed = Bed(CARD, tmp_path / "box")
@@ -155,7 +155,9 @@ def test_a_start_whose_answer_is_lost_is_played_to_rest(
 
 
 @pytest.mark.parametrize("call", ["IsTaskDone", "WriteDigitalLines"])
-def test_a_stall_inside_a_heartbeat_is_seen(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stall_inside_a_heartbeat_is_a_lost_machine(
+    call: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bed = Bed()
     backend = open_backend(bed)
     backend.start()
@@ -174,7 +176,7 @@ def test_a_stall_inside_a_heartbeat_is_seen(call: str, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("rate_hz", [250.0, 500.0, 1000.0])
-def test_a_tare_is_read_in_pieces_that_come_in_time(rate_hz: float) -> None:
+def test_tare_is_read_in_pieces_that_come_in_time(rate_hz: float) -> None:
     bed = Bed(CARD.replace("rates_hz = [", "rates_hz = [250.0, 500.0, "))
     backend = bed.backend(rate_hz)
     backend.open()
@@ -182,7 +184,7 @@ def test_a_tare_is_read_in_pieces_that_come_in_time(rate_hz: float) -> None:
     backend.close()
 
 
-def test_an_error_before_the_start_says_that_nothing_has_moved(
+def test_error_before_the_start_is_a_lost_machine(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bed = Bed()
@@ -198,7 +200,7 @@ def test_an_error_before_the_start_says_that_nothing_has_moved(
     backend.close()
 
 
-def test_a_driver_that_takes_a_replacement_and_plays_what_was_there_is_refused(
+def test_driver_that_ignores_a_replacement_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     write = SimulatedDaqDevice.write
@@ -214,7 +216,7 @@ def test_a_driver_that_takes_a_replacement_and_plays_what_was_there_is_refused(
     assert error.value.where.endswith("drive_disp_m")
 
 
-def test_the_test_of_a_replacement_is_eight_steps_of_the_output(tmp_path: Path) -> None:
+def test_test_of_a_replacement_is_eight_steps_of_the_output(tmp_path: Path) -> None:
     bed = Bed(CARD, tmp_path / "box")
     bed.backend().open()
     bed.rest()
@@ -223,7 +225,7 @@ def test_the_test_of_a_replacement_is_eight_steps_of_the_output(tmp_path: Path) 
     assert most < 1e-3 * bed.rig.output.span_mm * 1e-3  # what is at rest
 
 
-def test_what_a_dead_rig_left_is_found_by_a_card_of_another_name() -> None:
+def test_tasks_of_a_dead_rig_are_cleared_by_another_rig() -> None:
     bed = Bed()
     gone = open_backend(bed)
     gone.start()
@@ -234,7 +236,7 @@ def test_what_a_dead_rig_left_is_found_by_a_card_of_another_name() -> None:
     backend.close()
 
 
-def test_a_device_that_another_program_has_is_named_with_what_to_do() -> None:
+def test_device_in_use_is_refused_with_a_remedy() -> None:
     bed = Bed()
     theirs, _ = bed.device.create_task("theirs", 1)
     bed.device.add_channel(theirs, "ai", "Dev1/ai0")
@@ -244,7 +246,7 @@ def test_a_device_that_another_program_has_is_named_with_what_to_do() -> None:
     assert error.value.remedy == REMEDIES[-50103]
 
 
-def test_a_position_that_follows_the_output_is_no_other_rig(
+def test_moving_write_position_is_no_other_rig(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bed = Bed()
@@ -262,7 +264,7 @@ def test_a_position_that_follows_the_output_is_no_other_rig(
     bed.backend().open()
 
 
-def test_a_device_whose_memory_cannot_be_cut_says_so_late_and_is_asked_without(
+def test_device_with_fixed_memory_is_opened(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     bed = Bed(CARD.replace("held_by_device_ms = 20.0", "held_by_device_ms = 4200.0"))
@@ -279,7 +281,7 @@ def test_a_device_whose_memory_cannot_be_cut_says_so_late_and_is_asked_without(
     backend.close()
 
 
-def test_a_channel_that_is_not_there_is_named() -> None:
+def test_channel_that_is_not_there_is_named() -> None:
     bed = Bed()
     wrong = parse_toml(CARD.replace('"Dev1/ai8"', '"Dev1/ai9"'), RigConfig, "card")
     with pytest.raises(InputError, match=r"-200170 .*Dev1/ai9"):
@@ -294,7 +296,7 @@ def test_only_a_simulated_table_is_advised_to_start_one() -> None:
     assert "shaketwin table" not in refusal.value.remedy
 
 
-def test_a_run_ends_before_the_driver_cannot_count_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_ends_before_the_driver_cannot_count_on(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("table_io.backends.ni.backend.MAX_WRITE_INDEX", 9000)
     bed = Bed()
     backend = open_backend(bed)
@@ -306,7 +308,7 @@ def test_a_run_ends_before_the_driver_cannot_count_on(monkeypatch: pytest.Monkey
     bed.rest()
 
 
-def test_a_served_card_needs_an_address() -> None:
+def test_served_card_needs_an_address() -> None:
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
     with pytest.raises(InputError) as error:
         ServerEndpoint(get_wiring(local))

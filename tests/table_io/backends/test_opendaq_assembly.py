@@ -16,12 +16,12 @@ from table_io.backends.opendaq.timestamps import (
 from table_io.errors import InputError
 
 
-def test_a_stamp_is_a_place() -> None:
+def test_stamp_is_a_place() -> None:
     ticks = np.array([1000, 1500, 2500, 2999], dtype=np.int64)
     assert sample_indices(ticks, 1000, 500.0).tolist() == [0, 1, 3, 4]
 
 
-def test_a_clock_that_does_not_tick_in_whole_samples() -> None:
+def test_clock_that_does_not_tick_in_whole_samples() -> None:
     """3000 Hz in microseconds: 333.33 a sample, an hour later still in place."""
     index = np.array([0, 1, 2, 10_800_000], dtype=np.int64)
     ticks = np.rint(index * 1e6 / 3000.0).astype(np.int64)
@@ -29,7 +29,7 @@ def test_a_clock_that_does_not_tick_in_whole_samples() -> None:
 
 
 @pytest.mark.parametrize("off", [200, -200, 250])
-def test_a_stamp_between_two_samples_is_refused(off: int) -> None:
+def test_stamp_between_two_samples_is_refused(off: int) -> None:
     with pytest.raises(UnevenClockError, match=r"0\.[45]"):
         sample_indices(np.array([1000, 1500 + off], dtype=np.int64), 1000, 500.0)
 
@@ -43,7 +43,7 @@ def test_time_that_goes_back_is_refused() -> None:
         assembly.put(0, np.array([5, 4]), np.zeros(2))
 
 
-def test_what_does_not_come_is_nan_and_what_comes_too_late_is_dropped() -> None:
+def test_missing_samples_are_nan_and_late_ones_dropped() -> None:
     assembly = Assembly(2)
     assembly.put(0, np.array([-2, -1, 0, 1, 4]), np.array([9.0, 9.0, 0.0, 1.0, 4.0]))
     assert (assembly.complete, assembly.end) == (0, 5)
@@ -88,7 +88,7 @@ def test_pieces_and_cuts_change_no_sample(pieces: list[int], cuts: list[int], se
     assert assembly._values.shape[1] >= GROWTH_SAMPLES
 
 
-def test_a_clock_that_is_set_forward_is_told_and_takes_no_memory() -> None:
+def test_clock_jump_takes_no_memory() -> None:
     assembly = Assembly(2, 10_000)
     assembly.put(0, np.arange(100), np.zeros(100))
     assembly.put(1, np.arange(100), np.zeros(100))
@@ -101,7 +101,7 @@ def test_a_clock_that_is_set_forward_is_told_and_takes_no_memory() -> None:
     assembly.put(0, np.arange(5000, 5010), np.zeros(10))  # a loss
 
 
-def test_a_channel_that_was_given_up_is_waited_for_when_it_speaks_again() -> None:
+def test_channel_that_returns_is_waited_for() -> None:
     assembly = Assembly(2, 10_000)
     assembly.put(0, np.arange(100), np.zeros(100))
     assert assembly.complete == 0
@@ -113,7 +113,7 @@ def test_a_channel_that_was_given_up_is_waited_for_when_it_speaks_again() -> Non
     assert assembly.complete == 19_991
 
 
-def test_stamps_that_drift_are_placed_by_what_they_drifted() -> None:
+def test_drifting_stamps_are_placed() -> None:
     ticks = np.array([1000, 1500, 2000], dtype=np.int64) + 300
     assert sample_indices(ticks, 1000, 500.0, 300.0).tolist() == [0, 1, 2]
 

@@ -102,14 +102,14 @@ def driving(address: Address, samples: int = 600) -> UdpBackend:
     return backend
 
 
-def test_nobody_there_says_what_to_look_at() -> None:
+def test_absent_target_is_refused_with_a_remedy() -> None:
     rig = rig_at(("127.0.0.1", free_port()))
     with pytest.raises(InputError, match=r"127\.0\.0\.1") as error:
         UdpBackend(rig, SPECIMEN, RATE_HZ, CLOCK).open()
     assert "shaketwin table --rig udp_simulated" in error.value.remedy
 
 
-def test_the_machine_card_names_the_backend_and_asking_claims_nothing(target: Served) -> None:
+def test_check_reachable_of_a_target_claims_nothing(target: Served) -> None:
     profile = load_config(PROFILES_DIR / "tests" / "quickstart.toml", Profile, "test profile")[0]
     assert isinstance(open_backend(rig_at(target.address), profile, CLOCK), UdpBackend)
     check_reachable(rig_at(target.address))
@@ -120,7 +120,7 @@ def test_the_machine_card_names_the_backend_and_asking_claims_nothing(target: Se
     backend.close()
 
 
-def test_a_rig_that_only_asks_needs_no_port_that_another_has(target: Served) -> None:
+def test_rig_that_only_asks_needs_no_port_that_another_has(target: Served) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("", 0))
         held = f"rig_port = {other.getsockname()[1]}\nreplace_after"
@@ -128,7 +128,7 @@ def test_a_rig_that_only_asks_needs_no_port_that_another_has(target: Served) -> 
         check_reachable(parse_toml(text, RigConfig, "udp"))
 
 
-def test_a_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
+def test_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far:
         far.bind(("127.0.0.1", 0))
         own = free_port()
@@ -157,7 +157,7 @@ def test_a_target_that_answers_one_port_only_is_asked_from_that_one() -> None:
 
 
 @pytest.mark.parametrize("sequence", [2**31 + 10, 2**32 - 40])
-def test_a_target_that_has_sent_very_many_packets_is_heard(
+def test_sequence_numbers_of_an_old_target_wrap(
     sequence: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Old(UdpTarget):
@@ -189,9 +189,7 @@ def test_of_two_numbers_the_newer_is_less_than_half_way_round_ahead() -> None:
         ("bits = 18", "bits = 16", ""),
     ],
 )
-def test_a_card_that_does_not_fit_says_where_and_what(
-    target: Served, old: str, new: str, key: str
-) -> None:
+def test_wiring_that_does_not_fit_is_refused(target: Served, old: str, new: str, key: str) -> None:
     def claim() -> None:
         rig = parse_toml(card(target.address, "").replace(old, new), RigConfig, "card")
         UdpBackend(rig, SPECIMEN, RATE_HZ, CLOCK).open()
@@ -205,7 +203,7 @@ def test_a_card_that_does_not_fit_says_where_and_what(
     again.close()
 
 
-def test_one_rig_at_a_time(target: Served) -> None:
+def test_rig_at_a_time(target: Served) -> None:
     first = driving(target.address)
     with pytest.raises(InputError, match=REASON_TEXTS[Reason.BUSY]):
         rig_side(target.address).open()
@@ -213,14 +211,14 @@ def test_one_rig_at_a_time(target: Served) -> None:
     first.close()
 
 
-def test_a_port_that_is_taken_is_named(target: Served) -> None:
+def test_port_that_is_taken_is_named(target: Served) -> None:
     with pytest.raises(InputError) as error:
         bind_socket(target.address)
     assert error.value.key == "udp.target"
     assert error.value.value == f"{target.address[0]}:{target.address[1]}"
 
 
-def test_a_rig_that_was_away_too_long_is_told_so(target: Served) -> None:
+def test_absent_rig_loses_the_target(target: Served) -> None:
     backend = driving(target.address)
     CLOCK.wait_until(CLOCK.now() + HEARTBEAT_TIMEOUT_S + 0.15)
     with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SILENCE]):
@@ -234,7 +232,7 @@ def test_a_rig_that_was_away_too_long_is_told_so(target: Served) -> None:
     again.close()
 
 
-def test_a_target_that_is_switched_off_says_so_and_ends_at_rest() -> None:
+def test_target_that_is_switched_off_ends_at_rest() -> None:
     with serve_target() as server:
         backend = driving(server.address)
     with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SWITCHED_OFF]):
@@ -251,7 +249,7 @@ class Mute(Relay):
         return [] if self.mute else [data]
 
 
-def test_a_target_that_died_is_a_lost_machine_after_what_has_come(target: Served) -> None:
+def test_dead_target_is_a_lost_machine(target: Served) -> None:
     with closing(Mute(target.address, 1)) as relay, closing(driving(relay.address)) as backend:
         backend.read(80)
         relay.mute = True
@@ -283,7 +281,7 @@ def test_samples_that_never_come_are_nan_in_their_place(target: Served) -> None:
     assert np.isnan(volts[:, lost]).all()
 
 
-def test_at_five_per_cent_of_every_evil_all_samples_come(target: Served) -> None:
+def test_all_samples_come_at_five_percent_of_every_loss(target: Served) -> None:
     with (
         relay_packets(target.address, seed=3, share=0.05) as relay,
         closing(rig_side(relay.address)) as backend,
@@ -298,7 +296,7 @@ def test_at_five_per_cent_of_every_evil_all_samples_come(target: Served) -> None
     assert min(counts.values()) > 3, counts
 
 
-def test_the_c_target_survives_whatever_comes(tmp_path: Path) -> None:
+def test_c_target_survives_invalid_packets(tmp_path: Path) -> None:
     """Watched by the compiler's sanitizers: noise, spoilt words, and whole ones without sense."""
     program, port, chance = compile_sanitized(tmp_path), free_port(), np.random.default_rng(1)
     odd = [0, 1, 127, 128, 129, 511, 512, 65535, 65536, 65537, 2**31, 2**32 - 1]

@@ -67,7 +67,7 @@ def same(packet: RigPacket | TargetState, other: RigPacket | TargetState | None)
 
 
 @given(WORDS)
-def test_a_word_comes_back_as_it_was(word: RigPacket) -> None:
+def test_word_comes_back_as_it_was(word: RigPacket) -> None:
     packet = encode_rig_packet(word)
     assert len(packet) == RIG_PACKET_BYTES == 1092
     assert same(word, decode_rig_packet(packet))
@@ -75,7 +75,7 @@ def test_a_word_comes_back_as_it_was(word: RigPacket) -> None:
 
 
 @given(STATES)
-def test_a_state_comes_back_as_it_was(state: TargetState) -> None:
+def test_state_comes_back_as_it_was(state: TargetState) -> None:
     packet = encode_target_state(state)
     assert len(packet) == TARGET_PACKET_BYTES == 1172
     assert same(state, decode_target_state(packet))
@@ -83,7 +83,7 @@ def test_a_state_comes_back_as_it_was(state: TargetState) -> None:
 
 
 @given(WORDS, STATES, st.data())
-def test_a_packet_with_a_spoilt_byte_is_none(
+def test_packet_with_a_spoilt_byte_is_none(
     word: RigPacket, state: TargetState, data: st.DataObject
 ) -> None:
     for packet, decode in (
@@ -97,14 +97,14 @@ def test_a_packet_with_a_spoilt_byte_is_none(
         assert decode(packet + b"\0") is None
 
 
-def test_another_version_and_unknown_words_are_none() -> None:
+def test_unknown_version_and_kind_are_ignored() -> None:
     for at, value in ((4, 2), (6, 6), (20, VALUES_PER_PACKET + 1)):
         body = bytearray(encode_rig_packet(RigPacket(PacketKind.BEAT)))[:-4]
         body[at] = value
         assert decode_rig_packet(bytes(body) + struct.pack("<I", zlib.crc32(body))) is None
 
 
-def test_the_document_says_where_every_field_is() -> None:
+def test_document_states_the_offset_of_every_field() -> None:
     """PACKETS.md has a row `offset | type | name` for each field of the two headers, in order."""
     text = (Path(udp.__file__).parent / "PACKETS.md").read_text()
     sizes = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i64": 8, "f64": 8}
@@ -123,7 +123,7 @@ def test_the_document_says_where_every_field_is() -> None:
 
 
 @given(st.lists(st.integers(1, 20), min_size=1, max_size=30), st.randoms(use_true_random=False))
-def test_samples_keep_their_place_in_whatever_order_they_come(cuts: list[int], chance) -> None:
+def test_samples_in_any_order_keep_their_place(cuts: list[int], chance) -> None:
     whole = np.arange(2.0 * sum(cuts)).reshape(-1, 2).T
     edges = np.cumsum([0, *cuts])
     pieces = [(int(a), whole[:, a:b]) for a, b in itertools.pairwise(edges)]
@@ -143,7 +143,7 @@ def test_samples_keep_their_place_in_whatever_order_they_come(cuts: list[int], c
     np.testing.assert_array_equal(np.concatenate(taken, axis=1), whole)
 
 
-def test_what_is_lost_for_good_is_nan() -> None:
+def test_samples_given_up_are_nan() -> None:
     arriving = ReceiveBuffer(1)
     arriving.put(0, np.zeros((1, 5)))
     arriving.put(8, np.zeros((1, 2)))
@@ -161,7 +161,7 @@ def test_samples_far_beyond_any_sense_are_not_kept() -> None:
     assert arriving.end == 0
 
 
-def test_a_command_goes_in_a_window_and_what_is_not_heard_of_goes_again() -> None:
+def test_command_transfer_resends_within_a_window() -> None:
     volts = np.arange(float(VALUES_PER_PACKET * 40 + 3))
     delivery = CommandTransfer(volts)
     first = delivery.pop_due(0.0)
@@ -185,7 +185,7 @@ def test_a_command_goes_in_a_window_and_what_is_not_heard_of_goes_again() -> Non
 
 
 @pytest.mark.parametrize("ppm", [-200.0, 0.0, 200.0])
-def test_the_schedule_follows_the_clock_of_the_target(ppm: float) -> None:
+def test_schedule_follows_the_clock_of_the_target(ppm: float) -> None:
     """An hour with 0.2 to 10 ms on the way: its schedule stays within a sample of the truth."""
     chance, pace = np.random.default_rng(1), 1.0 + ppm * 1e-6
     offset = ClockOffset(0.01, 0.0)

@@ -17,7 +17,7 @@ def make_backbone(**keys: Any) -> Backbone:
     return parse_toml(f'kind = "backbone"\n{text}\n', Backbone, "profile")
 
 
-def test_a_point_takes_at_most_100_periods_by_default() -> None:
+def test_point_takes_at_most_100_periods_by_default() -> None:
     config = make_backbone()
     evaluation = config.settle_cycles + config.measured_cycles
     assert config.blend_cycles + evaluation + config.updates * (2 + evaluation) <= 100

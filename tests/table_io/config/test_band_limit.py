@@ -45,7 +45,7 @@ def acceleration(t: Float1D) -> Float1D:
     )
 
 
-def test_the_displacement_of_a_known_acceleration_comes_back() -> None:
+def test_displacement_of_a_known_acceleration_comes_back() -> None:
     drift = 0.3 + 0.05 * TIME_S  # m/s2, which would drift by 100 m
     corrected = correct_baseline(acceleration(TIME_S) + drift, "linear")
     motion = limit_band(corrected, RATE_HZ, (0.1, 50.0), integrate=True)
@@ -56,7 +56,7 @@ def test_the_displacement_of_a_known_acceleration_comes_back() -> None:
     assert np.abs(motion[:20]).max() < 1e-5 * 8e-3
 
 
-def test_the_filter_is_a_butterworth_of_order_4_forward_and_backward() -> None:
+def test_filter_is_a_butterworth_of_order_4_forward_and_backward() -> None:
     values = np.random.default_rng(3).standard_normal(8000)
     values *= np.sin(np.pi * np.arange(8000) / 8000) ** 2
     pad = round(6.0 / 0.5 * RATE_HZ)
@@ -70,7 +70,7 @@ def test_the_filter_is_a_butterworth_of_order_4_forward_and_backward() -> None:
 
 
 @pytest.mark.parametrize(("f_hz", "gain"), [(0.5, 0.5), (2.0, 1.0), (10.0, 0.5), (20.0, 1 / 257)])
-def test_the_gain_is_half_at_the_corners(f_hz: float, gain: float) -> None:
+def test_gain_is_half_at_the_corners(f_hz: float, gain: float) -> None:
     t = np.arange(round(200 * RATE_HZ)) / RATE_HZ
     pad = round(6.0 / 0.5 * RATE_HZ)
     played = limit_band(np.sin(2 * np.pi * f_hz * t), RATE_HZ, (0.5, 10.0), integrate=False)
@@ -80,7 +80,7 @@ def test_the_gain_is_half_at_the_corners(f_hz: float, gain: float) -> None:
 
 
 @pytest.mark.parametrize("baseline", ["none", "mean", "linear"])
-def test_a_baseline_is_removed_as_far_as_asked(baseline: str) -> None:
+def test_baseline_is_removed_as_far_as_asked(baseline: str) -> None:
     line = 2.0 + 0.1 * TIME_S
     corrected = correct_baseline(line, baseline)  # type: ignore[arg-type]
     expected = {"none": line, "mean": line - line.mean(), "linear": 0.0 * line}[baseline]
@@ -116,7 +116,7 @@ def load(folder: Path, more: str = "") -> tuple[Profile, RecordedHistory]:
         ("length_ratio = 0.5\nacceleration_ratio = 2.0\nscale = 0.5", 0.25, 0.5),
     ],
 )
-def test_the_table_moves_by_the_laws_of_similitude(
+def test_table_moves_by_the_laws_of_similitude(
     keys: str, displacement_ratio: float, time_ratio: float, tmp_path: Path
 ) -> None:
     profile, _ = load(tmp_path, keys)
@@ -133,7 +133,7 @@ def test_the_table_moves_by_the_laws_of_similitude(
     assert played[0] == played[-1] == 0.0
 
 
-def test_a_displacement_is_filtered_if_a_band_is_set(tmp_path: Path) -> None:
+def test_displacement_is_filtered_if_a_band_is_set(tmp_path: Path) -> None:
     rows = "".join(
         f"{t:.3f},{5 * np.sin(np.pi * t / 20) ** 2 * (np.sin(W * t) + np.sin(4 * np.pi * t * 6))}\n"
         for t in TIME_S.tolist()
@@ -187,21 +187,21 @@ def test_el_centro_as_shipped_is_played_as_its_source_states() -> None:
         ('baseline = "cubic"', "excitation.baseline", {"problem": "'linear'"}),
     ],
 )
-def test_a_processing_that_cannot_be_is_refused(
+def test_processing_that_cannot_be_is_refused(
     keys: str, key: str, fields: dict[str, str], tmp_path: Path
 ) -> None:
     with raises_input_error(key=key, **fields):
         load(tmp_path, keys)
 
 
-def test_a_short_record_is_filtered_from_one_cycle_in_its_duration(tmp_path: Path) -> None:
+def test_short_record_is_filtered_from_one_cycle_in_its_duration(tmp_path: Path) -> None:
     _, record = load(tmp_path)
     assert record.applied_band_hz == (0.1, 25.0)
     _, record = load(tmp_path, "length_ratio = 0.0625")  # 5 s on the table
     assert record.applied_band_hz == (pytest.approx(0.2), 25.0)
 
 
-def test_a_baseline_of_a_displacement_is_refused(tmp_path: Path) -> None:
+def test_baseline_of_a_displacement_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{t:.3f},{np.sin(t)}\n" for t in TIME_S.tolist())
     (tmp_path / "motion.csv").write_text("time_s,disp_mm\n" + rows)
     (tmp_path / "test.toml").write_text(TEST + 'baseline = "mean"\n')

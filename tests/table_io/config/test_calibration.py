@@ -26,7 +26,7 @@ def ramp(channels: int) -> np.ndarray:
     return np.linspace(-3.0, 4.0, 7 * channels).reshape(channels, 7)
 
 
-def test_the_sign_and_the_unit_of_the_convention() -> None:
+def test_sign_and_the_unit_of_the_convention() -> None:
     # 2 kN of compression on a cell that shows 0.4 kN at rest and gives -0.5 V a kN.
     volts = si_to_volts(np.array([[2000.0]]), (REVERSED,), {"force_l1_n": 400.0})
     assert volts[0, 0] == pytest.approx((2.0 + 0.4) * -0.5)
@@ -45,7 +45,7 @@ def test_both_directions_undo_each_other(offsets: list[float]) -> None:
     np.testing.assert_allclose(back, values, rtol=0, atol=1e-9)
 
 
-def test_a_channel_without_tare_has_no_offset() -> None:
+def test_channel_without_tare_has_no_offset() -> None:
     sensors, values = (*RIG.sensors, REVERSED), ramp(len(RIG.sensors) + 1)
     other = {"none of these": 5.0, RIG.channels[2]: 0.5}
     slope = np.array([sensor.volts_per_si for sensor in sensors])[:, None]
@@ -54,7 +54,7 @@ def test_a_channel_without_tare_has_no_offset() -> None:
     np.testing.assert_allclose(volts_to_si(values, sensors, other), values / slope - offset)
 
 
-def test_a_tare_removes_what_the_sensors_show_at_rest() -> None:
+def test_tare_removes_what_the_sensors_show_at_rest() -> None:
     shown = {name: 0.01 * (place + 1) for place, name in enumerate(RIG.channels)}
     rest = si_to_volts(np.zeros((len(RIG.channels), 100)), RIG.sensors, shown)
     tare = compute_tare(rest, RIG.sensors)
@@ -64,7 +64,7 @@ def test_a_tare_removes_what_the_sensors_show_at_rest() -> None:
     np.testing.assert_allclose(volts_to_si(moved, RIG.sensors, tare)[1:], 1.0, atol=1e-12)
 
 
-def test_a_sample_lost_during_the_tare_does_not_lose_the_channel() -> None:
+def test_sample_lost_during_the_tare_does_not_lose_the_channel() -> None:
     rest = si_to_volts(np.zeros((len(RIG.channels), 100)), RIG.sensors, {"table_disp_m": 0.002})
     rest[1, 3] = np.nan
     rest[4, :] = np.nan
@@ -73,7 +73,7 @@ def test_a_sample_lost_during_the_tare_does_not_lose_the_channel() -> None:
     assert np.isnan(tare[RIG.channels[4]])  # no zero is known, so no value is made up
 
 
-def test_the_command_fills_its_span_and_comes_back() -> None:
+def test_command_fills_its_span_and_comes_back() -> None:
     output = OutputConfig(span_mm=60.0, span_v=10.0, bits=16)
     metres = np.linspace(-0.06, 0.06, 9)
     volts = command_to_volts(metres, output)

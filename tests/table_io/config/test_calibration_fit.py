@@ -25,7 +25,7 @@ def test_two_points_without_noise_are_exact() -> None:
 
 
 @pytest.mark.parametrize("points", [(0.0, 10.0), (-5.0, 0.0, 2.0, 10.0)])
-def test_the_uncertainty_is_the_scatter_of_many_calibrations(points: tuple[float, ...]) -> None:
+def test_uncertainty_is_the_scatter_of_many_calibrations(points: tuple[float, ...]) -> None:
     """Each point with its own noise: the standard deviation over 2000 of them is what is stated."""
     draw, sd = np.random.default_rng(1), np.linspace(1e-4, 4e-4, len(points))
     fits: list[CalibrationFit] = []
@@ -42,14 +42,14 @@ def test_the_uncertainty_is_the_scatter_of_many_calibrations(points: tuple[float
     assert np.mean([fit.volts_per_unit for fit in fits]) == pytest.approx(SENSITIVITY, abs=2e-5)
 
 
-def test_an_uncertain_reference_counts_as_noise() -> None:
+def test_uncertain_reference_counts_as_noise() -> None:
     points, means = (0.0, 10.0), tuple(MeanVoltage(mean, 0.0) for mean in volts((0.0, 10.0)))
     fit = fit_calibration(points, 0.05, means)
     # two independent errors of 0.05 over a span of 10
     assert fit.volts_per_unit_sd / SENSITIVITY == pytest.approx(math.sqrt(2) * 0.05 / 10.0)
 
 
-def test_a_bend_shows_as_linearity_and_widens_the_uncertainty() -> None:
+def test_bend_shows_as_linearity_and_widens_the_uncertainty() -> None:
     points = (-10.0, -5.0, 0.0, 5.0, 10.0)
     bent = [mean + 1e-3 * SENSITIVITY * x**2 for mean, x in zip(volts(points), points, strict=True)]
     fit = fit_calibration(points, 0.0, tuple(MeanVoltage(mean, 1e-6) for mean in bent))
@@ -74,7 +74,7 @@ def test_all_alike_is_refused() -> None:
         fit_calibration((1.0, 1.0), 0.0, (MeanVoltage(0.1, 1e-4), MeanVoltage(0.1, 1e-4)))
 
 
-def test_the_standard_error_is_that_of_the_mean_also_of_slow_noise() -> None:
+def test_standard_error_is_that_of_the_mean_also_of_slow_noise() -> None:
     draw = np.random.default_rng(2)
     slow = np.repeat(draw.standard_normal((400, 20)), 100, axis=1)  # 50 ms long each
     for noise in (draw.standard_normal((400, 2000)), slow):
@@ -92,7 +92,7 @@ def test_hum_does_not_move_the_mean(hz: float) -> None:
     assert mean.sd < 1e-9
 
 
-def test_lost_samples_do_not_count_and_nothing_is_made_up() -> None:
+def test_lost_samples_do_not_count() -> None:
     row = np.full(2000, 0.5)
     row[:700] = np.nan
     assert mean_voltage(row).volts == 0.5
@@ -100,7 +100,7 @@ def test_lost_samples_do_not_count_and_nothing_is_made_up() -> None:
 
 
 @pytest.mark.parametrize("known_chunks", range(11))
-def test_the_mean_is_that_of_the_tenths_that_have_samples(known_chunks: int) -> None:
+def test_mean_is_that_of_the_tenths_that_have_samples(known_chunks: int) -> None:
     row = np.random.default_rng(known_chunks).standard_normal(400)
     tenths = row.reshape(10, 40)
     tenths[known_chunks:] = np.nan
@@ -120,7 +120,7 @@ def test_the_mean_is_that_of_the_tenths_that_have_samples(known_chunks: int) -> 
 @pytest.mark.parametrize("noise", [0.2, 5.0])
 @pytest.mark.parametrize("applied_sd", [0.0, 0.02])
 @pytest.mark.parametrize("zeros", [0, 1])
-def test_the_fit_is_weighted_least_squares_with_propagated_covariance(
+def test_fit_is_weighted_least_squares_with_propagated_covariance(
     sensitivity: float, count: int, noise: float, applied_sd: float, zeros: int
 ) -> None:
     """`noise` in the stated errors; `zeros` points have none, so all weigh the same then."""
@@ -154,7 +154,7 @@ def test_the_fit_is_weighted_least_squares_with_propagated_covariance(
         assert fit.linearity_percent == pytest.approx(100.0 * share, rel=1e-6)
 
 
-def test_a_dead_sensor_has_no_offset_and_no_linearity() -> None:
+def test_dead_sensor_has_no_offset_and_no_linearity() -> None:
     means = (MeanVoltage(0.0, 1e-4),) * 3
     fit = fit_calibration((-5.0, 0.0, 5.0), 0.0, means)
     assert fit.volts_per_unit == 0.0

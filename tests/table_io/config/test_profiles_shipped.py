@@ -39,7 +39,7 @@ def read(path: Path) -> Profile:
 
 
 @pytest.mark.parametrize("name", PAPER)
-def test_a_test_of_the_paper_is_driven_as_in_the_paper(name: str) -> None:
+def test_test_of_the_paper_is_driven_as_in_the_paper(name: str) -> None:
     gap_mm, grid = PAPER[name]
     profile = read(PROFILES_DIR / "tests" / f"{name}.toml")
     sweep = profile.sweep
@@ -51,7 +51,7 @@ def test_a_test_of_the_paper_is_driven_as_in_the_paper(name: str) -> None:
     assert "Stefani" in profile.citation
 
 
-def test_the_quickstart_covers_the_primary_resonance_of_g4_both_ways() -> None:
+def test_quickstart_covers_the_primary_resonance_of_g4_both_ways() -> None:
     profile = read(PROFILES_DIR / "tests" / "quickstart.toml")
     assert profile.specimen.gap_mm == 4.0
     assert {"forward", "backward"} == set(profile.sweep.directions)
@@ -69,11 +69,11 @@ def test_the_quickstart_covers_the_primary_resonance_of_g4_both_ways() -> None:
         "campaigns/paper",
     ],
 )
-def test_the_files_that_users_script_against_are_there(name: str) -> None:
+def test_files_that_users_script_against_are_there(name: str) -> None:
     assert (PROFILES_DIR / f"{name}.toml").is_file()
 
 
-def test_no_shipped_test_goes_unmentioned() -> None:
+def test_list_of_shipped_tests_is_complete() -> None:
     assert {path.stem for path in SHIPPED} == {
         *PAPER, "demo", "quickstart", "record_example", "el_centro", "rehearsal",
         *TOOLS, *PLANNED_BY_TWIN,
@@ -85,7 +85,7 @@ def test_no_shipped_test_goes_unmentioned() -> None:
     [path for path in SHIPPED if path.stem not in PLANNED_BY_TWIN],
     ids=lambda path: path.stem,
 )
-def test_a_shipped_test_passes_its_pre_flight_without_a_warning(path: Path) -> None:
+def test_shipped_test_passes_its_pre_flight_without_a_warning(path: Path) -> None:
     profile = read(path)
     rig = load_config(find_config(profile.rig, "rigs", path), RigConfig, "machine card")[0]
     assert find_config(profile.model, "models", path).is_file()

@@ -66,7 +66,7 @@ def history(path: Path) -> tuple[Float1D, Float1D, Profile]:
 
 @pytest.mark.parametrize("file_hz", [64.0, 100.0, 128.0, 500.0, 2000.0, 5000.0])
 @pytest.mark.parametrize("rig_hz", [1000.0, 2000.0])
-def test_the_history_is_that_of_the_file_at_the_rate_of_the_rig(
+def test_history_is_that_of_the_file_at_the_rate_of_the_rig(
     file_hz: float, rig_hz: float, tmp_path: Path
 ) -> None:
     path = write(tmp_path, csv(file_hz), f"[acquisition]\nrate_hz = {rig_hz}\n")
@@ -75,7 +75,7 @@ def test_the_history_is_that_of_the_file_at_the_rate_of_the_rig(
     assert np.abs(1e3 * played - motion_mm(t)).max() < 1e-4
 
 
-def test_a_falling_rate_leaves_no_alias() -> None:
+def test_falling_rate_leaves_no_alias() -> None:
     t = np.arange(4000) / 1000.0
     envelope = np.sin(np.pi * t / 4) ** 4
     assert np.abs(resample(envelope * np.sin(2 * np.pi * 80 * t), 1000.0, 100.0)).max() < 1e-5
@@ -98,7 +98,7 @@ def test_unit_and_scale_are_applied(header: str, keys: str, factor: float, tmp_p
     assert np.abs(1e3 * played - factor * motion_mm(t)).max() < 1e-3 * abs(factor)
 
 
-def test_a_record_in_motion_at_its_ends_is_blended_in_and_out(tmp_path: Path) -> None:
+def test_record_in_motion_at_its_ends_is_blended_in_and_out(tmp_path: Path) -> None:
     def cosine(t: Float1D) -> Float1D:
         return 3.0 + np.cos(2 * np.pi * 0.5 * t + 0.3)
 
@@ -141,7 +141,7 @@ def faulty(line: int, text: str) -> str:
         (csv(), "[sweep]\nstart_hz = 1.0", "file", ("[sweep]", "[excitation]")),
     ],
 )
-def test_a_fault_of_the_profile_or_its_file_is_named(
+def test_fault_of_the_profile_or_its_file_is_named(
     text: str, more: str, key: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
     with pytest.raises(InputError) as refusal:
@@ -153,7 +153,7 @@ def test_a_fault_of_the_profile_or_its_file_is_named(
 
 
 @pytest.mark.parametrize("name", ["recrod", 3, [1.0]])
-def test_an_unknown_kind_is_refused_with_the_known_ones(name: object, tmp_path: Path) -> None:
+def test_unknown_kind_is_refused_with_the_known_ones(name: object, tmp_path: Path) -> None:
     path = write(tmp_path, csv())
     path.write_text(path.read_text().replace('"record"', repr(name)))
     with pytest.raises(InputError) as refusal:
@@ -163,7 +163,7 @@ def test_an_unknown_kind_is_refused_with_the_known_ones(name: object, tmp_path: 
     assert (fault.remedy == "did you mean 'record'?") == (name == "recrod")
 
 
-def test_a_missing_file_is_named(tmp_path: Path) -> None:
+def test_missing_file_is_named(tmp_path: Path) -> None:
     path = write(tmp_path, csv(), file="other.csv")
     with pytest.raises(InputError) as refusal:
         load_profile(path)
@@ -171,7 +171,7 @@ def test_a_missing_file_is_named(tmp_path: Path) -> None:
     assert refusal.value.where == str(path)
 
 
-def test_a_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) -> None:
+def test_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, csv() + "#" * MAX_FILE_BYTES)
     with pytest.raises(InputError) as refusal:
         load_profile(path)
@@ -187,7 +187,7 @@ def test_a_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) 
         ("", "", csv() + "# '''"),
     ],
 )  # fmt: skip
-def test_a_file_that_cannot_be_attached_is_refused(
+def test_file_that_cannot_be_attached_is_refused(
     old: str, new: str, text: str, tmp_path: Path
 ) -> None:
     path = write(tmp_path, text)
@@ -199,7 +199,7 @@ def test_a_file_that_cannot_be_attached_is_refused(
     assert (refusal.value.where, refusal.value.key) == (str(path), "excitation")
 
 
-def test_the_text_holds_the_file_so_that_nothing_else_is_needed(tmp_path: Path) -> None:
+def test_text_of_a_profile_holds_its_file(tmp_path: Path) -> None:
     path = write(tmp_path, csv())
     profile, text = load_profile(path)
     (tmp_path / "motion.csv").unlink()
@@ -210,7 +210,7 @@ def test_the_text_holds_the_file_so_that_nothing_else_is_needed(tmp_path: Path) 
     assert load_profile(path) == (profile, text)
 
 
-def test_the_text_without_its_file_is_refused() -> None:
+def test_text_without_its_file_is_refused() -> None:
     with pytest.raises(InputError) as refusal:
         parse_toml(TEST, Profile, "some/test.toml")
     assert [fault.key for fault in refusal.value.faults] == ["excitation.file"]
@@ -231,7 +231,7 @@ def test_the_text_without_its_file_is_refused() -> None:
         (4.0, lambda t: motion_mm(t) * np.sin(2 * np.pi * 8 * t), "force", "at most 30 kN"),
     ],
 )
-def test_a_record_beyond_a_limit_of_the_rig_is_refused(
+def test_record_beyond_a_limit_of_the_rig_is_refused(
     scale: float, motion: Callable[[Float1D], Float1D], key: str, allowed: str, tmp_path: Path
 ) -> None:
     profile, _ = load_profile(write(tmp_path, csv(motion=motion), f"scale = {scale}\n"))
@@ -242,7 +242,7 @@ def test_a_record_beyond_a_limit_of_the_rig_is_refused(
 
 
 @pytest.mark.parametrize("scale", ["1e-5", "1e-170"])
-def test_a_record_too_small_for_the_output_is_refused(scale: str, tmp_path: Path) -> None:
+def test_record_too_small_for_the_output_is_refused(scale: str, tmp_path: Path) -> None:
     """Of some tens of millimetres, so that a hundred-thousandth is below one step of 18 bits."""
     profile, _ = load_profile(write(tmp_path, csv(), f"scale = {scale}\n"))
     rows = compute_demands(plan_excitation(profile), profile, RIG)
@@ -252,7 +252,7 @@ def test_a_record_too_small_for_the_output_is_refused(scale: str, tmp_path: Path
     assert (fault.key, fault.allowed) == ("displacement", "at least 20")
 
 
-def test_a_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
+def test_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
     profile, _ = load_profile(write(tmp_path, csv(), "[acquisition]\nrate_hz = 1500.0\n"))
     with pytest.raises(InputError) as refusal:
         check_limits(compute_demands(plan_excitation(profile), profile, RIG), profile, RIG, "test")
@@ -261,7 +261,7 @@ def test_a_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
     assert fault.allowed == "1000, 2000, 4000"
 
 
-def test_a_drive_file_of_this_program_is_a_record() -> None:
+def test_drive_file_of_this_program_is_a_record() -> None:
     series = read_series(
         "# shaketwin drive of x\n# unit mm\ntime_s,drive_disp_mm\n"
         + "".join(f"{k / 2000:.7f},{k:.9f}\n" for k in range(20)),

@@ -6,7 +6,7 @@ import tomllib
 from table_io.config.toml_text import format_toml
 
 
-def test_a_table_is_read_as_it_was_written() -> None:
+def test_table_is_read_as_it_was_written() -> None:
     table = {
         "title": 'a "quote" \\ back\nline \x7f é',
         "gap_mm": math.inf,

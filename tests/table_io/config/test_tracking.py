@@ -43,7 +43,7 @@ def write(folder: Path, more: str, spectrum: str | None = SPECTRUM) -> Path:
     return path
 
 
-def test_the_spectrum_travels_with_the_profile(tmp_path: Path) -> None:
+def test_spectrum_travels_with_the_profile(tmp_path: Path) -> None:
     profile, text = load_profile(write(tmp_path, TRACKING))
     spectrum = profile.tracking.spectrum
     assert spectrum is not None
@@ -68,23 +68,6 @@ def test_nothing_is_required_without_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("table", "fields"),
-    [
-        ("band_hz = [8.0, 1.0]", {"key": "tracking.band_hz", "remedy": "exchange"}),
-        ("band_hz = [1.0, 1200.0]", {"key": "tracking", "allowed": "1000"}),
-        ("band_hz = [1.0]", {"key": "tracking.band_hz.1"}),
-        ("damping = 0.0", {"key": "tracking.damping"}),
-        ("required_upper = 0.9", {"key": "tracking.required_upper"}),
-        ("bandwidth_hz = 1.0", {"key": "tracking.bandwidth_hz", "remedy": "band_hz"}),
-        ('required_spectrum = "other.csv"', {"key": "tracking.required_spectrum"}),
-    ],
-)
-def test_a_fault_is_named(table: str, fields: dict[str, str], tmp_path: Path) -> None:
-    with raises_input_error(**fields):
-        load_profile(write(tmp_path, f"[tracking]\n{table}\n"))
-
-
-@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("", "missing"),
@@ -96,17 +79,17 @@ def test_a_fault_is_named(table: str, fields: dict[str, str], tmp_path: Path) ->
         ("frequency_hz,sa_g\n1,1\n2,nan\n", "line 3"),
     ],
 )
-def test_a_fault_of_the_spectrum_is_named(text: str, message: str, tmp_path: Path) -> None:
+def test_fault_of_the_spectrum_is_named(text: str, message: str, tmp_path: Path) -> None:
     with raises_input_error(key="tracking.required_spectrum", problem=message):
         load_profile(write(tmp_path, TRACKING, text))
 
 
-def test_a_spectrum_that_is_too_large_is_refused(tmp_path: Path) -> None:
+def test_spectrum_that_is_too_large_is_refused(tmp_path: Path) -> None:
     with raises_input_error(problem="MB", allowed="0.25"):
         load_profile(write(tmp_path, TRACKING, SPECTRUM + "#" * MAX_SPECTRUM_BYTES))
 
 
-def test_a_stepped_sine_has_no_history_to_be_tracked() -> None:
+def test_stepped_sine_has_no_history_to_be_tracked() -> None:
     assert parse_toml(SWEEP, Profile, "x").tracking == TrackingConfig()
     with raises_input_error(key="tracking", remedy="remove"):
         parse_toml(SWEEP + "[tracking]\ndamping = 0.02\n", Profile, "x")

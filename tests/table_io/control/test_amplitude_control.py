@@ -99,7 +99,7 @@ def make_fit(
 @pytest.mark.parametrize("correction", [0.51, 0.9, 1.0, 1.3, 1.97])
 @pytest.mark.parametrize("gain", [0.3, 0.8, 1.0])
 @pytest.mark.parametrize("clamp_db", [0.5, 2.0, 6.0])
-def test_a_correction_changes_by_the_error_to_the_gain_within_its_bounds(
+def test_correction_changes_by_the_error_to_the_gain_within_its_bounds(
     correction: float, gain: float, clamp_db: float
 ) -> None:
     config = ControlConfig(gain=gain, clamp_db=clamp_db)
@@ -165,7 +165,7 @@ def test_each_update_leaves_a_fifth_of_every_overtone(
 
 @pytest.mark.parametrize("order", [2, 3, 4, 5])
 @pytest.mark.parametrize("goal", ["15 dB", "noise"])
-def test_an_overtone_at_its_goal_keeps_its_shape(goal: str, order: int) -> None:
+def test_overtone_at_its_goal_keeps_its_shape(goal: str, order: int) -> None:
     """The goal: 15 dB below the first evaluation, at least 3 sd of an amplitude in noise."""
     rms = 0.02
     first = make_fit(A, tuple(0.05 * k * np.exp(1j * k) for k in (2, 3, 4, 5)))
@@ -187,7 +187,7 @@ def test_an_overtone_at_its_goal_keeps_its_shape(goal: str, order: int) -> None:
 
 
 @pytest.mark.parametrize("gain", [0.1, 0.5, 0.8, 1.0, 1.6, 2.0, 9.0])
-def test_a_prediction_inverts_the_gain_within_its_bounds(gain: float) -> None:
+def test_prediction_inverts_the_gain_within_its_bounds(gain: float) -> None:
     tuning = Tuning(FrequencyResponse(0, (2.0,), (gain,), (0.0,)))
     expected = min(max(1.0 / gain, 0.5), 2.0)
     for frequency_hz in (1.0, 2.0, 7.0):
@@ -196,7 +196,7 @@ def test_a_prediction_inverts_the_gain_within_its_bounds(gain: float) -> None:
         assert predicted.correction == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_remembered_target_takes_the_level_of_the_step() -> None:
+def test_remembered_target_takes_the_level_of_the_step() -> None:
     accepted = SineTarget(3.0, A, 1.1, (0.01j,))
     tuning = Tuning(RESPONSE).add_accepted(accepted).add_accepted(SineTarget(3.4, A, 1.3))
     assert tuning.predict_target(Step(5, "backward", 3.0, 2.0 * A)) == replace(

@@ -9,7 +9,7 @@ from table_io.control.order_tracking import evaluate_gain, evaluate_transfer
 from table_io.records import FrequencyResponse
 
 
-def test_one_point_gives_a_constant_gain_and_a_constant_delay() -> None:
+def test_point_gives_a_constant_gain_and_a_constant_delay() -> None:
     fitted = FrequencyResponse(0, (2.0,), (0.9,), (-0.2,))
     for f in (0.5, 2.0, 8.0):
         assert evaluate_transfer(fitted, f) == pytest.approx(0.9 * cmath.exp(-0.1j * f))

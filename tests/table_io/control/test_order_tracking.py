@@ -24,7 +24,7 @@ def wave(
     return offset + np.imag(np.array(amplitudes) @ turns), phase
 
 
-def test_a_phase_that_the_drive_blends_is_followed() -> None:
+def test_phase_that_the_drive_blends_is_followed() -> None:
     time = np.arange(4000) / RATE_HZ
     phase = 2.0 * time + 0.4 * time**2  # a chirp
     fit = track_harmonics(0.7 * np.sin(2 * np.pi * phase + 0.2), phase)
@@ -72,7 +72,7 @@ def test_fit_needs_two_samples_for_each_coefficient(orders: int) -> None:
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
-def test_a_lost_sample_leaves_no_order_with_a_number(lost: float) -> None:
+def test_lost_sample_leaves_no_order_with_a_number(lost: float) -> None:
     values, phase = wave(100.0, 30, [1.0])  # five orders of ten
     values[7] = lost
     fit = track_harmonics(values, phase)

@@ -119,7 +119,7 @@ def test_peak_ratio_is_that_of_the_worst_phase(
 
 
 @every_blend
-def test_a_decay_lasts_two_cycles_of_its_frequency_or_half_a_second(segment: Segment) -> None:
+def test_decay_lasts_two_cycles_of_its_frequency_or_half_a_second(segment: Segment) -> None:
     for x in (0.0, *X, 1.0):
         duration_s = max(2.0 / frequency_at(segment, x), 0.5)
         exact = duration_s * RATE_HZ
@@ -131,7 +131,7 @@ def make_history(count: int = 60, start: int = 25) -> HistorySegment:
     return HistorySegment(start, 1e-3 * values, 7)
 
 
-def test_a_history_is_played_sample_by_sample_with_rest_around_it() -> None:
+def test_history_is_played_sample_by_sample_with_rest_around_it() -> None:
     history = make_history()
     padded = np.concatenate([np.zeros(3), history.history_m, np.zeros(3)])
     index = np.arange(-2, history.count + 2)
@@ -149,7 +149,7 @@ def test_a_history_is_played_sample_by_sample_with_rest_around_it() -> None:
 
 
 @pytest.mark.parametrize("edge", [0, -1])
-def test_a_history_that_is_largest_at_its_edge_starts_and_ends_at_rest(edge: int) -> None:
+def test_history_that_is_largest_at_its_edge_starts_and_ends_at_rest(edge: int) -> None:
     values = np.zeros(9)
     values[edge] = -1e-3
     assert HistorySegment(0, values, 1).peaks == pytest.approx((1e-3, 1e-3, 2e-3))
@@ -165,7 +165,7 @@ def test_windows_of_a_history_are_equal_parts() -> None:
 
 
 @pytest.mark.parametrize("frequency_hz", [0.5, 1.0, 3.0, 12.0])
-def test_the_decay_of_a_history_is_the_shortest_that_bounds_its_acceleration(
+def test_decay_of_a_history_is_the_shortest_that_bounds_its_acceleration(
     frequency_hz: float,
 ) -> None:
     time_s = np.arange(8000) / RATE_HZ
@@ -243,7 +243,7 @@ def test_every_sample_is_that_of_the_latest_segment_that_contains_it(
     np.testing.assert_array_equal(drive.labels(first, last - first), labels)
 
 
-def test_a_decay_lasts_as_its_first_segment_says_and_ends_with_the_drive() -> None:
+def test_decay_lasts_as_its_first_segment_says_and_ends_with_the_drive() -> None:
     drive = make_drive()
     assert (drive.planned_end, drive.rest_start, drive.decay_samples) == (530, 530, 0)
     for at in range(90, 560):
@@ -262,7 +262,7 @@ def test_outside_a_drive_its_first_or_last_segment_applies() -> None:
     assert drive.segment_at(10_000) is drive.segments[-1]
 
 
-def test_a_drive_without_segments_is_at_rest() -> None:
+def test_drive_without_segments_is_at_rest() -> None:
     drive = Drive(RATE_HZ, (), ())
     assert (drive.planned_end, drive.rest_start) == (0, 0)
     stopped = drive.decay_from(5)

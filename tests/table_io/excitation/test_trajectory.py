@@ -35,7 +35,7 @@ def moving(target: SineTarget, phase: float = 0.0) -> Trajectory:
 
 @pytest.mark.parametrize("min_cycles", [0.5, 1.5, 3.0])
 @pytest.mark.parametrize(("start", "target"), ENDS)
-def test_a_blend_is_the_shortest_that_keeps_its_peak(
+def test_blend_is_the_shortest_that_keeps_its_peak(
     start: SineTarget, target: SineTarget, min_cycles: float
 ) -> None:
     """Of the lengths that grow by a quarter cycle of the mean frequency."""
@@ -64,11 +64,11 @@ def test_a_blend_is_the_shortest_that_keeps_its_peak(
     assert blended.phase == pytest.approx((0.3 + turns) % 1.0, abs=1e-12)
 
 
-def test_a_blend_to_the_same_motion_is_none() -> None:
+def test_blend_to_the_same_motion_is_none() -> None:
     assert moving(SLOW).append_blend(replace(SLOW), 0, 2.0, Label.BLEND).segments == ()
 
 
-def test_a_hold_keeps_its_target_and_advances_the_phase() -> None:
+def test_hold_keeps_its_target_and_advances_the_phase() -> None:
     held = moving(SLOW, 0.9).append_hold(430, 3, Label.MEASURE, 4, 1)
     assert held.segments == (
         Segment(300, 430, Label.MEASURE, 3, 2.0, 2.0, 0.5, 0.5, 0.9, 4, 1, 1.2, 1.2, (0.01j,),
@@ -97,7 +97,7 @@ def test_rest_and_histories_need_a_table_at_rest() -> None:
             append()
 
 
-def test_a_cut_keeps_the_motion_before_it_and_ends_where_it_may() -> None:
+def test_cut_keeps_the_motion_before_it_and_ends_where_it_may() -> None:
     """A steady motion is cut at the sample, a blend at its end, rest at the sample."""
     trajectory = (
         AT_REST.append_blend(SLOW, 0, 2.0, Label.BLEND)
@@ -132,19 +132,19 @@ def test_a_cut_keeps_the_motion_before_it_and_ends_where_it_may() -> None:
         replace(SLOW, correction=1.1), replace(SLOW, shape=(0.02j,)),
     ],
 )  # fmt: skip
-def test_what_changes_a_motion_is_a_blend_and_is_not_cut(target: SineTarget) -> None:
+def test_cut_keeps_a_blend(target: SineTarget) -> None:
     blended = moving(SLOW).append_blend(target, 0, 2.0, Label.BLEND)
     assert blended.cut(350) == blended
 
 
-def test_a_history_is_not_cut() -> None:
+def test_history_is_not_cut() -> None:
     played = AT_REST.append_history(np.zeros(40), 1)
     assert played.cut(300).segments == ()
     with pytest.raises(ValueError, match="301"):
         played.cut(301)
 
 
-def test_a_drive_ends_with_a_soft_stop_of_its_last_step() -> None:
+def test_drive_ends_with_a_soft_stop_of_its_last_step() -> None:
     held = moving(FAST).append_hold(500, 6, Label.MEASURE)
     steps = (Step(6, "forward", 9.0, 0.4),)
     drive = held.to_drive(steps)
@@ -166,7 +166,7 @@ def make_profile(**changes: object) -> Profile:
 
 @pytest.mark.parametrize("rest_s", [1.0, 1.5003])
 @pytest.mark.parametrize("rate_hz", [1000.0, 2000.0])
-def test_a_trajectory_starts_after_its_rest(rate_hz: float, rest_s: float) -> None:
+def test_trajectory_starts_after_its_rest(rate_hz: float, rest_s: float) -> None:
     acquisition = {"rate_hz": rate_hz, "rest_s": rest_s}
     start = start_trajectory(make_profile(acquisition=acquisition))
     assert -1e-9 <= start.end - rest_s * rate_hz < 1.0

@@ -50,7 +50,7 @@ def list_findings(
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_typical_laboratory_is_left_alone(seed: int, tmp_path: Path) -> None:
+def test_typical_laboratory_is_left_alone(seed: int, tmp_path: Path) -> None:
     assert list_findings(tmp_path, "typical", seed) == []
 
 
@@ -64,7 +64,7 @@ def test_a_typical_laboratory_is_left_alone(seed: int, tmp_path: Path) -> None:
         ({"kind": "stuck", "channel": "table_disp_m"}, {"stuck", "following"}),
     ],
 )
-def test_a_fault_is_found_in_a_typical_laboratory(
+def test_fault_is_found_in_a_typical_laboratory(
     fault: dict[str, Any], kinds: set[str], tmp_path: Path
 ) -> None:
     findings = list_findings(tmp_path, "typical", 1, None, {"at_s": FAULT_TIME_S, **fault})
@@ -75,7 +75,7 @@ def test_a_fault_is_found_in_a_typical_laboratory(
 
 
 @pytest.mark.parametrize("only", ["highpass", "load_sharing", "laser_nonlinearity"])
-def test_a_bad_instrument_is_no_fault_of_the_table(only: str, tmp_path: Path) -> None:
+def test_bad_instrument_is_no_fault_of_the_table(only: str, tmp_path: Path) -> None:
     findings = [finding for _, finding in list_findings(tmp_path, "bad", 1, only)]
     # A low cut makes the accelerometer read less than the level that the table plays.
     assert {finding.kind for finding in findings} <= {"consistency", "drift", "share", "level"}

@@ -49,7 +49,7 @@ def identify_servo() -> FrequencyResponse:
         (2000.0, 1.0, float("inf")),
     ],
 )
-def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float) -> None:
+def test_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float) -> None:
     rig = make_faulty_rig(noise=noise, seed=round(rate_hz + 10 * noise))
     assert play_guarded(profile(gap_mm, rate_hz), rig, identify_servo()).findings == []
 
@@ -62,7 +62,7 @@ def test_a_sound_table_is_left_alone(rate_hz: float, noise: float, gap_mm: float
         {"servo_bandwidth_hz": 15.0, "servo_delay_ms": 30.0},
     ],
 )
-def test_whatever_servo_a_sound_table_has(servo: dict[str, Any]) -> None:
+def test_sound_table_with_any_servo_is_not_stopped(servo: dict[str, Any]) -> None:
     findings = play_guarded(profile(), make_faulty_rig((), **servo)).findings
     assert {(finding.kind, finding.stop) for finding in findings} <= {("level", False)}
 
@@ -113,7 +113,7 @@ FAULTS: tuple[tuple[dict[str, Any], set[str], bool, float], ...] = (
     FAULTS,
     ids=[f"{fault[0]['kind']} {fault[0].get('channel', '')}" for fault in FAULTS],
 )
-def test_a_planted_fault_is_found(
+def test_planted_fault_is_found(
     fault: dict[str, Any], kinds: set[str], stops: bool, within_s: float
 ) -> None:
     rig = make_faulty_rig(({"at_s": FAULT_TIME_S, **fault},))
@@ -148,7 +148,7 @@ def test_every_planted_fault_of_every_size_is_found_by_a_session() -> None:
     assert sum(outcome.early for outcome in outcomes) == 0
 
 
-def test_a_session_records_what_was_found_and_comes_to_rest() -> None:
+def test_session_records_what_was_found_and_comes_to_rest() -> None:
     outcome = try_fault(
         short("middle"), {"kind": "polarity", "channel": "mass_acc_m_s2"}, 21.0, 3.4
     )
@@ -156,7 +156,7 @@ def test_a_session_records_what_was_found_and_comes_to_rest() -> None:
     assert outcome.cycles < 3.0
 
 
-def test_the_study_plants_every_kind() -> None:
+def test_study_plants_every_kind() -> None:
     from table_io.sim.config import FAULT_KINDS
 
     assert {fault["kind"] for fault in faults()} == set(FAULT_KINDS)

@@ -55,7 +55,7 @@ def evaluate_lines(
     }
 
 
-def test_the_hands_prove_what_the_rig_has() -> None:
+def test_list_stimuli_of_the_rig() -> None:
     assert [hand.channels for hand in (TABLE, MASS, RIGHT, LEFT)] == [
         ("table_acc_m_s2", "table_disp_m"),
         ("mass_acc_m_s2", "mass_disp_m"),
@@ -66,11 +66,11 @@ def test_the_hands_prove_what_the_rig_has() -> None:
 
 @pytest.mark.parametrize("seed", range(20))
 @pytest.mark.parametrize("hand", [TABLE, MASS, RIGHT, LEFT])
-def test_noise_is_no_hand(hand: Stimulus, seed: int) -> None:
+def test_noise_is_no_tap(hand: Stimulus, seed: int) -> None:
     assert find_tap_onset(hand, make_response({}, seed=seed)) is None
 
 
-def test_a_tap_to_the_right_is_felt_when_it_comes_and_passes() -> None:
+def test_tap_to_the_right_passes() -> None:
     swings = {"table_acc_m_s2": tap(0.2), "table_disp_m": tap(0.4, hz=8.0)}
     at = find_tap_onset(TABLE, make_response(swings))
     assert at is not None
@@ -84,7 +84,7 @@ def test_a_tap_to_the_right_is_felt_when_it_comes_and_passes() -> None:
 
 
 @pytest.mark.parametrize("turned", ["table_acc_m_s2", "table_disp_m"])
-def test_a_sensor_that_is_turned_round_is_found_by_its_own_line(turned: str) -> None:
+def test_sensor_that_is_turned_round_is_found_by_its_own_line(turned: str) -> None:
     swings = {"table_acc_m_s2": tap(0.2), "table_disp_m": tap(0.4, hz=8.0)}
     lines = evaluate_lines(TABLE, swings | {turned: -swings[turned]})
     assert [key for key, line in lines.items() if line.verdict == "fail"] == [("polarity", turned)]
@@ -92,20 +92,20 @@ def test_a_sensor_that_is_turned_round_is_found_by_its_own_line(turned: str) -> 
     assert "volts_per_unit" in lines["polarity", turned].do
 
 
-def test_the_first_swing_counts_and_not_the_largest() -> None:
+def test_first_swing_counts_and_not_the_largest() -> None:
     swing = tap(0.2)
     swing[AT + 60 : AT + 120] -= 0.5 * np.hanning(60)  # it bumps back harder
     lines = evaluate_lines(TABLE, {"table_acc_m_s2": swing})
     assert lines["polarity", "table_acc_m_s2"].verdict == "pass"
 
 
-def test_what_does_not_move_clearly_is_not_judged() -> None:
+def test_unclear_motion_is_not_judged() -> None:
     lines = evaluate_lines(TABLE, {"table_acc_m_s2": tap(0.2), "table_disp_m": tap(0.02, hz=8.0)})
     assert lines["polarity", "table_disp_m"].verdict == "not tested"
     assert lines["polarity", "table_acc_m_s2"].verdict == "pass"
 
 
-def test_a_channel_that_comes_late_is_found() -> None:
+def test_channel_that_comes_late_is_found() -> None:
     lines = evaluate_lines(
         TABLE, {"table_acc_m_s2": tap(0.2), "table_disp_m": tap(0.4, AT + 300, 8.0)}
     )
@@ -152,7 +152,7 @@ def test_lost_samples_are_no_swing() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_press_in_the_samples_at_rest_proves_nothing(sign: float) -> None:
+def test_press_in_the_samples_at_rest_proves_nothing(sign: float) -> None:
     """Good cells do not fail and turned ones do not pass where a person was too quick."""
     early = {name: sign * press(1.0, BEFORE // 2) for name in RIGHT.channels}
     assert is_disturbed(RIGHT, make_response(early))
@@ -176,7 +176,7 @@ def test_cells_that_are_still_pressed_are_not_taken_for_swapped_ones() -> None:
     assert {line.verdict for line in evaluate_tap(LEFT, free, "nobody")} == {"pass"}
 
 
-def test_what_swings_in_the_samples_at_rest_is_not_the_first_swing() -> None:
+def test_swing_at_rest_is_not_the_first_swing() -> None:
     swing = tap(0.2)
     swing[100] = -0.004  # below what is clear alone, and not small beside the tap's own first
     response = make_response({"table_acc_m_s2": swing})
@@ -201,7 +201,7 @@ def with_shunt(size: float) -> RigConfig:
     ],
 )
 @pytest.mark.parametrize("size", [1.0, -1.0])
-def test_a_shunt_proves_sign_and_gain(shift: float, verdict: str, what: str, size: float) -> None:
+def test_shunt_proves_sign_and_gain(shift: float, verdict: str, what: str, size: float) -> None:
     rig = with_shunt(size)
     hand = list_stimuli(rig)[-1]
     assert hand.shunt
@@ -211,7 +211,7 @@ def test_a_shunt_proves_sign_and_gain(shift: float, verdict: str, what: str, siz
     assert what in line.do
 
 
-def test_a_shunt_that_nobody_switched() -> None:
+def test_shunt_that_was_not_switched_is_not_tested() -> None:
     rig = with_shunt(1.0)
     hand = list_stimuli(rig)[-1]
     assert find_tap_onset(hand, make_response({"force_l2_n": press(0.2)}, rig)) is None
@@ -224,7 +224,7 @@ def test_a_shunt_that_nobody_switched() -> None:
     ("noise", "lsb_share", "expected"),
     [(0.5, 1e-9, 0.5), (0.0, 1e-9, 1e-5), (np.nan, 1e-9, 1e-5), (0.0, 1e-3, 1e-3)],
 )
-def test_a_swing_stands_out_of_noise_converter_and_range(
+def test_swing_stands_out_of_noise_converter_and_range(
     channel: str, noise: float, lsb_share: float, expected: float
 ) -> None:
     """All in shares of the range; the smallest swing is ten times the largest of the three."""

@@ -50,11 +50,11 @@ def failing(values: Float2D, rate: float = RATE) -> set[tuple[str, str]]:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_what_is_right_passes(seed: int) -> None:
+def test_sound_wiring_passes(seed: int) -> None:
     assert failing(still(seed=seed)) == set()
 
 
-def test_every_channel_has_every_line_and_each_says_what_to_do_where_it_is_not_a_pass() -> None:
+def test_every_channel_has_every_line() -> None:
     results = lines(still())
     for sensor in RIG.sensors[1:]:
         names = [line.name for line in results if line.channel == sensor.channel]
@@ -74,7 +74,7 @@ def spoilt(row: int, values: np.ndarray | float) -> Float2D:
     return out
 
 
-def test_a_lost_channel_is_lost_and_nothing_else_is_said_of_it() -> None:
+def test_lost_channel_has_no_other_failure() -> None:
     values = spoilt(ACC, np.nan)
     assert failing(values) == {("lost samples", "table_acc_m_s2")}
     assert [line.value for line in lines(values) if line.channel == "table_acc_m_s2"] == [100.0]
@@ -83,7 +83,7 @@ def test_a_lost_channel_is_lost_and_nothing_else_is_said_of_it() -> None:
     assert failing(values) == {("lost samples", "force_l2_n")}
 
 
-def test_a_stuck_channel_from_the_first_sample_or_later() -> None:
+def test_stuck_channel_from_the_first_sample_or_later() -> None:
     assert ("stuck", "table_acc_m_s2") in failing(spoilt(ACC, 0.001))
     values = still()
     values[ACC, 5000:] = values[ACC, 4999]
@@ -111,14 +111,14 @@ def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_channel_at_its_rail(sign: float) -> None:
+def test_channel_at_its_rail(sign: float) -> None:
     assert ("at the rail", "table_disp_m") in failing(spoilt(LASER, sign * 75.0))
     values = still()
     values[LASER, 7] = sign * 75.0
     assert ("at the rail", "table_disp_m") in failing(values)
 
 
-def test_a_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
+def test_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
     quiet = 2e-5 * np.random.default_rng(5).standard_normal(SAMPLES)  # 100 dB under 2 g
     results = {line.channel: line for line in lines(spoilt(ACC, quiet)) if line.name == "noise"}
     assert results["table_acc_m_s2"].verdict == "fail"
@@ -128,7 +128,7 @@ def test_a_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
     assert failing(loud) == {("noise", "table_acc_m_s2")}
 
 
-def test_a_card_without_noise_is_told_what_to_put_there() -> None:
+def test_unknown_noise_is_not_tested_and_measured() -> None:
     sensors = tuple(sensor.model_copy(update={"noise_rms": 0.0}) for sensor in RIG.sensors)
     rig = RIG.model_copy(update={"sensors": sensors})
     results = [line for line in lines(still(), rig=rig) if line.name == "noise"]
@@ -143,7 +143,7 @@ def test_a_card_without_noise_is_told_what_to_put_there() -> None:
     ("mains", "rate"),
     [(49.9, 1000.0), (50.0, 2000.0), (50.13, 4000.0), (60.0, 1000.0), (59.95, 2000.0)],
 )
-def test_hum_is_told_with_its_mains_and_its_size(mains: float, rate: float) -> None:
+def test_hum_has_frequency_and_size(mains: float, rate: float) -> None:
     t = np.arange(SAMPLES) / rate
     values = still()
     values[CELL] += 0.004 * np.sqrt(2) * np.sin(2 * np.pi * mains * t + 0.3)
@@ -172,7 +172,7 @@ def test_hum_in_two_channels_is_hum_and_not_one_signal_twice() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_one_signal_at_two_inputs(sign: float) -> None:
+def test_signal_at_two_inputs(sign: float) -> None:
     values = still()
     other = RIG.channels.index("mass_acc_m_s2")
     values[other] = sign * values[ACC]
@@ -195,7 +195,7 @@ def test_offset_drift_and_spike() -> None:
     assert failing(values) == {("spikes", "table_acc_m_s2")}
 
 
-def test_the_offset_of_the_card_is_where_the_range_begins() -> None:
+def test_offset_of_the_card_is_where_the_range_begins() -> None:
     """A laser that stands 40 mm off is right where its card says so."""
     sensors = tuple(
         sensor.model_copy(update={"offset": 40.0}) if sensor.channel == "table_disp_m" else sensor
@@ -210,7 +210,7 @@ def test_the_offset_of_the_card_is_where_the_range_begins() -> None:
     assert not [line for line in lines(values, rig=rig) if line.verdict == "fail"]
 
 
-def test_the_bits_that_noise_leaves() -> None:
+def test_bits_that_noise_leaves() -> None:
     resting = RestingInputs(RIG, RATE, still() * GAIN)
     laser = RIG.sensors[LASER]
     assert resting.effective_bits(LASER) == pytest.approx(
@@ -227,7 +227,7 @@ def test_the_bits_that_noise_leaves() -> None:
 @pytest.mark.parametrize(
     ("shown_mm", "passed"), [(0.0, True), (0.05, True), (0.07, False), (-6.0, False)]
 )
-def test_a_command_that_is_not_at_0_volts(shown_mm: float, passed: bool) -> None:
+def test_command_that_is_not_at_0_volts(shown_mm: float, passed: bool) -> None:
     values = spoilt(0, shown_mm)
     (line,) = check_zero_command(RestingInputs(RIG, RATE, values * GAIN))
     assert (line.verdict == "pass") is passed
@@ -239,7 +239,7 @@ def test_a_command_that_is_not_at_0_volts(shown_mm: float, passed: bool) -> None
 
 
 @pytest.mark.parametrize("hz", [0.5, 1.0, 10.0])
-def test_a_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> None:
+def test_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> None:
     """+-8 V, whose mean over a tare of one second is nothing."""
     values = spoilt(0, 48.0 * np.sin(2 * np.pi * hz * TIME + 0.1))[:, :2000]
     values[0, 700] = np.nan  # one that was lost hides nothing
@@ -249,7 +249,7 @@ def test_a_command_that_swings_about_0_volts_is_not_at_0_volts(hz: float) -> Non
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 1.0])
-def test_the_size_of_hum_is_free_of_the_noise_that_its_tones_catch(share: float) -> None:
+def test_size_of_hum_is_free_of_the_noise_that_its_tones_catch(share: float) -> None:
     rate_hz, count, trials = 2000.0, 1000, 40
     t = np.arange(count) / rate_hz
     noise = np.random.default_rng(2).standard_normal((trials, count))

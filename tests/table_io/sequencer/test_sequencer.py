@@ -97,7 +97,7 @@ def levels(table: Table, segment: Any) -> Float1D:
 
 
 @pytest.mark.parametrize("samples", [1, 7, 64, 500])
-def test_the_cut_of_the_samples_changes_nothing(samples: int) -> None:
+def test_cut_of_the_samples_changes_nothing(samples: int) -> None:
     test = profile(directions=["forward"], stop_hz=3.0)
     whole, cut = play_test(test), play_test(test, samples=samples)
     size = min(whole.at, cut.at)
@@ -107,7 +107,7 @@ def test_the_cut_of_the_samples_changes_nothing(samples: int) -> None:
     assert whole.state.drive == cut.state.drive
 
 
-def test_the_level_is_reached_at_every_step_and_frozen_while_it_is_measured() -> None:
+def test_level_is_reached_at_every_step_and_frozen_while_it_is_measured() -> None:
     table = play_test(profile())
     held = [segment for segment in sine_segments(table.state.drive) if segment.cycles]
     assert len(held) == 6
@@ -129,7 +129,7 @@ def test_the_level_is_reached_at_every_step_and_frozen_while_it_is_measured() ->
     assert least < 0.75 * A
 
 
-def test_a_correction_is_reused_on_the_way_back() -> None:
+def test_correction_is_reused_on_the_way_back() -> None:
     table = play_test(profile())
     updates: dict[int, int] = {}
     for record in table.records:
@@ -153,7 +153,7 @@ def test_no_update_asks_for_more_than_its_clamp_nor_for_more_than_105_percent() 
     assert np.abs(ideal).max() <= 1.05 * A
 
 
-def test_a_level_that_cannot_be_reached_is_said_and_the_test_goes_on() -> None:
+def test_unreached_level_is_an_event() -> None:
     table = play_test(profile({"updates": 1, "clamp_db": 0.5}), gain=lambda f: 0.5 + 0 * f)
     events = [record for record in table.records if isinstance(record, Event)]
     assert events
@@ -169,7 +169,7 @@ def test_without_control_the_drive_is_the_plan() -> None:
 
 
 @pytest.mark.parametrize("name", ["quickstart", "g4_ss3", "gm10"])
-def test_a_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
+def test_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
     test = load_config(PROFILES_DIR / "tests" / f"{name}.toml", Profile, "test")[0]
     sweep = test.sweep.model_copy(update={"stop_hz": test.sweep.start_hz + test.sweep.step_hz})
     test = test.model_copy(
@@ -183,7 +183,7 @@ def test_a_rehearsal_is_what_a_perfect_table_plays(name: str) -> None:
 
 
 @pytest.mark.parametrize("where", [0.2, 0.5, 0.9])
-def test_a_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) -> None:
+def test_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) -> None:
     test = profile()
     whole = nominal_drive(make_test_plan(test, RIG, 40))
     table = Table(np.ones_like, start_test(make_test_plan(test, RIG, 40)))
@@ -211,7 +211,7 @@ def test_a_hold_stays_at_its_step_and_the_step_is_measured_anew(where: float) ->
     assert first > before.size + 8000
 
 
-def test_a_hold_or_a_resume_out_of_place_changes_nothing() -> None:
+def test_hold_or_a_resume_out_of_place_changes_nothing() -> None:
     test = profile()
     state = start_test(make_test_plan(test, RIG, 40))
     assert resume_test(state, 100) is state

@@ -47,7 +47,7 @@ def quiet(rig: RigConfig) -> RigConfig:
     return rig.model_copy(update={"sensors": sensors})
 
 
-def test_a_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared() -> None:
+def test_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared() -> None:
     block = acquire_sine(quiet(make_lab_rig()))
     mass, table = block.channel("mass_acc_m_s2"), block.channel("table_acc_m_s2")
     assert np.ptp(mass) > 0.1
@@ -69,7 +69,7 @@ def test_noise_offset_range_and_steps_are_those_of_its_sensor() -> None:
     np.testing.assert_allclose(volts[row] / step, np.rint(volts[row] / step), atol=1e-6)
 
 
-def test_a_sealed_sensor_error_applies_to_a_declared_channel(tmp_path: Any) -> None:
+def test_sealed_sensor_error_applies_to_a_declared_channel(tmp_path: Any) -> None:
     truth = f"""
 [[effects]]
 id = "sensor_gain"
@@ -93,7 +93,7 @@ parameters = {{ gain = 2.0 }}
         (TEMPERATURE, "spike", "spike"),
     ],
 )
-def test_a_fault_of_a_declared_channel_is_found(channel: str, kind: str, finding_kind: str) -> None:
+def test_fault_of_a_declared_channel_is_found(channel: str, kind: str, finding_kind: str) -> None:
     fault = {"kind": kind, "at_s": 1.0, "channel": channel}
     fault |= {"size": 100.0} if kind == "spike" else {}
     assert play_guarded(PROFILE, make_lab_rig()).findings == []
@@ -117,7 +117,7 @@ def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None
     assert limits[row] - elsewhere[row] == pytest.approx(limits[table] - 1e-3 * 2.0 * 9.80665)
 
 
-def test_the_wiring_check_knows_them() -> None:
+def test_wiring_check_knows_them() -> None:
     rig = make_lab_rig()
     backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()
@@ -130,7 +130,7 @@ def test_the_wiring_check_knows_them() -> None:
 
 
 @pytest.mark.parametrize(("sign", "verdict"), [(-1.0, "pass"), (1.0, "fail")])
-def test_a_tap_proves_the_polarity_of_a_declared_sensor(sign: float, verdict: str) -> None:
+def test_tap_proves_the_polarity_of_a_declared_sensor(sign: float, verdict: str) -> None:
     from table_io.safety.wiring_check import TapResponse, evaluate_tap
 
     rig = make_lab_rig()

@@ -77,7 +77,7 @@ def test_every_kind_is_tried_here() -> None:
 
 @pytest.mark.parametrize("fault", ALL, ids=[str(fault["kind"]) for fault in ALL])
 @pytest.mark.parametrize("cut", [1, 7, 64, 500])
-def test_the_cut_into_reads_changes_no_fault(fault: dict[str, Any], cut: int) -> None:
+def test_cut_into_reads_changes_no_fault(fault: dict[str, Any], cut: int) -> None:
     if fault["kind"] == "stall":
         return
     if cut == 1 and fault["kind"] not in ("power_loss", "oil_loss", "repeated"):
@@ -103,14 +103,14 @@ def test_nothing_happens_before_a_fault_and_something_at_it(fault: dict[str, Any
     [fault for fault in ALL if fault.get("channel") and "for_s" in fault],
     ids=lambda f: f["kind"],
 )
-def test_a_sensor_fault_is_its_channel_s_alone_and_ends(fault: dict[str, Any]) -> None:
+def test_sensor_fault_is_its_channel_s_alone_and_ends(fault: dict[str, Any]) -> None:
     sound, broken = both(**fault)
     others = np.arange(len(sound)) != MASS
     np.testing.assert_array_equal(broken[others], sound[others])
     np.testing.assert_array_equal(broken[MASS, LAST:], sound[MASS, LAST:])
 
 
-def test_what_each_sensor_fault_shows() -> None:
+def test_sensor_faults_in_closed_form() -> None:
     inside = slice(FIRST, LAST)
     sound = read(make_faulty_rig())[MASS]
 
@@ -135,31 +135,31 @@ def test_what_each_sensor_fault_shows() -> None:
     assert spike[FIRST] == pytest.approx(20.0 * VOLTS_PER_MM)
 
 
-def test_a_fault_stays_within_the_range_of_the_converter() -> None:
+def test_fault_stays_within_the_range_of_the_converter() -> None:
     _, broken = both(kind="spike", channel="mass_disp_m", size=1e6)
     assert broken[MASS, FIRST] == 10.0
     _, broken = both(kind="gain", channel="mass_disp_m", size=1e6)
     assert np.abs(broken[MASS]).max() == 10.0
 
 
-def test_a_stuck_sensor_at_the_very_start_stays_there() -> None:
+def test_stuck_sensor_at_the_very_start_stays_there() -> None:
     broken = read(make_faulty_rig(({"kind": "stuck", "channel": "mass_disp_m", "at_s": 0.0},)))
     assert (broken[MASS] == broken[MASS, 0]).all()
 
 
-def test_a_dropped_block_keeps_its_place() -> None:
+def test_dropped_block_keeps_its_place() -> None:
     sound, broken = both(kind="dropped", for_s=FOR)
     assert np.isnan(broken[:, FIRST:LAST]).all()
     np.testing.assert_array_equal(broken[:, LAST:], sound[:, LAST:])
 
 
-def test_a_repeated_block_is_the_one_before_it() -> None:
+def test_repeated_block_is_the_one_before_it() -> None:
     sound, broken = both(kind="repeated", for_s=FOR)
     np.testing.assert_array_equal(broken[:, FIRST:LAST], sound[:, FIRST - 500 : LAST - 500])
     np.testing.assert_array_equal(broken[:, LAST:], sound[:, LAST:])
 
 
-def test_a_replayed_command_moves_the_table_again() -> None:
+def test_replayed_command_moves_the_table_again() -> None:
     sound, broken = both(kind="replayed", for_s=FOR)
     drive, table = 0, RIG.channels.index("table_disp_m")
     np.testing.assert_array_equal(broken[drive, FIRST:LAST], sound[drive, FIRST - 500 : LAST - 500])
@@ -185,7 +185,7 @@ def test_samples_come_late_by_the_size_and_only_once() -> None:
 
 
 @pytest.mark.parametrize("fault", [{"kind": "stall"}, {"kind": "late", "size": 0.6}])
-def test_a_machine_that_does_not_deliver_is_lost_after_its_patience(fault: dict[str, Any]) -> None:
+def test_machine_that_does_not_deliver_is_lost_after_its_patience(fault: dict[str, Any]) -> None:
     clock = ManualClock()
     backend = start_backend(make_faulty_rig(({"at_s": AT, **fault},)), clock=clock)
     backend.read(2000)
@@ -251,11 +251,11 @@ def refusal(text: str) -> str:
         ),
     ],
 )
-def test_a_wrong_card_says_what_is_right(text: str, says: str) -> None:
+def test_wrong_fault_table_is_refused(text: str, says: str) -> None:
     assert says in refusal(text)
 
 
-def test_the_kinds_are_spelled_out_in_the_module() -> None:
+def test_fault_kinds_are_documented() -> None:
     from table_io.sim import faults
 
     assert faults.__doc__ is not None

@@ -26,7 +26,7 @@ OSCILLATOR = [30.0 * complex(-0.1, 0.99), 30.0 * complex(-0.1, -0.99)]
         ([], [*OSCILLATOR, -4000.0 + 0j], 3e6),
     ],
 )
-def test_the_filter_is_exact_for_lines_between_samples(
+def test_filter_is_exact_for_lines_between_samples(
     zeros: list[complex], poles: list[complex], gain: float
 ) -> None:
     noise = np.random.default_rng(0).standard_normal((2, 400))
@@ -51,7 +51,7 @@ def test_it_starts_in_the_steady_state_of_its_first_sample(
 
 
 @pytest.mark.parametrize("samples", [1, 7, 64])
-def test_the_division_changes_no_bit(samples: int) -> None:
+def test_division_changes_no_bit(samples: int) -> None:
     values = np.random.default_rng(1).standard_normal((3, 300))
 
     def run(cuts: list[int]) -> tuple[Float2D, Float2D]:
@@ -69,7 +69,7 @@ def test_the_division_changes_no_bit(samples: int) -> None:
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.16, 1.0, 2.5, 17.3])
-def test_a_delay_moves_a_cubic_exactly(lag: float) -> None:
+def test_delay_moves_a_cubic_exactly(lag: float) -> None:
     t = np.arange(60.0)
 
     def cubic(at: np.ndarray) -> np.ndarray:

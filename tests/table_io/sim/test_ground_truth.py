@@ -76,7 +76,7 @@ def effect(name: str, channel: str | None = None, **parameters: float) -> str:
     return f'[[effects]]\nid = "{name}"\n{where}parameters = {{ {numbers} }}\n'
 
 
-def test_what_is_in_the_library_means_what_the_model_means() -> None:
+def test_effects_match_those_of_the_model() -> None:
     kinds = {kind.id: kind for kind in EFFECT_DEFINITIONS if kind.in_library}
     assert set(kinds) == {effect.id for effect in EFFECTS}
     for effect in EFFECTS:
@@ -111,9 +111,7 @@ def test_what_is_in_the_library_means_what_the_model_means() -> None:
         ("[base]\ngap_left_m = nan", "base.gap_left_m", ("nan",)),
     ],
 )
-def test_a_truth_that_makes_no_sense_is_refused(
-    text: str, key: str, names: tuple[str, ...]
-) -> None:
+def test_truth_that_makes_no_sense_is_refused(text: str, key: str, names: tuple[str, ...]) -> None:
     with pytest.raises(InputError) as error:
         parse_toml(text, GroundTruth, "truth.toml")
     (fault,) = error.value.faults
@@ -121,7 +119,7 @@ def test_a_truth_that_makes_no_sense_is_refused(
     assert all(name in f"{fault.problem} {fault.allowed} {fault.remedy}" for name in names)
 
 
-def test_the_seal_is_checked_and_the_file_is_named(tmp_path: Path) -> None:
+def test_seal_is_checked_and_the_file_is_named(tmp_path: Path) -> None:
     keys = seal_truth(tmp_path, PHYSICS)
     raw = CARD.model_dump()
     raw["simulated"].update(keys)
@@ -143,7 +141,7 @@ def test_the_seal_is_checked_and_the_file_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("key", ["truth", "truth_sha256"])
-def test_a_truth_without_its_hash_is_refused(key: str) -> None:
+def test_truth_without_its_hash_is_refused(key: str) -> None:
     value = {"truth": "a.toml", "truth_sha256": "0" * 64}[key]
     with pytest.raises(InputError) as error:
         parse_toml(CARD_TOML + f'{key} = "{value}"\n', RigConfig, "card")
@@ -151,7 +149,7 @@ def test_a_truth_without_its_hash_is_refused(key: str) -> None:
     assert fault.key == "simulated.truth_sha256"
 
 
-def test_the_key_hidden_of_the_rig_file_hides_without_a_seal(tmp_path: Path) -> None:
+def test_key_hidden_of_the_rig_file_hides_without_a_seal(tmp_path: Path) -> None:
     text = PHYSICS.replace("[base]", "[simulated.hidden.base]")
     text = text.replace("[[effects]]", "[[simulated.hidden.effects]]")
     rig = parse_toml(CARD_TOML + text, RigConfig, "card")
@@ -166,14 +164,14 @@ def test_the_key_hidden_of_the_rig_file_hides_without_a_seal(tmp_path: Path) -> 
     assert [fault.key for fault in error.value.faults] == ["simulated.truth_sha256"]
 
 
-def test_a_truth_with_nothing_in_it_is_no_truth(tmp_path: Path) -> None:
+def test_truth_with_nothing_in_it_is_no_truth(tmp_path: Path) -> None:
     plain, empty = machine(tmp_path, None, noise_rms=0.0), machine(tmp_path, "", noise_rms=0.0)
     step = [[2 * abs(s.range * s.volts_per_unit) / 2**s.bits] for s in CARD.sensors]
     lost = np.abs(acquire_run(empty, [3000]) - acquire_run(plain, [3000]))
     assert (lost <= 1.01 * np.array(step)).all()  # rounding may tip a converter by one step
 
 
-def test_the_cut_into_reads_changes_no_bit(tmp_path: Path) -> None:
+def test_cut_into_reads_changes_no_bit(tmp_path: Path) -> None:
     text = PHYSICS + effect("sensor_lag", "mass_acc_m_s2", lag=1.7e-3)
     text += effect("sensor_gain", "force_r1_n", gain=1.1)
     whole = acquire_run(machine(tmp_path, text), [3000])
@@ -195,7 +193,7 @@ def readings(folder: Path, text: str | None) -> tuple[Float2D, Float2D]:
 
 
 @pytest.mark.parametrize("lag", [0.0, 0.3e-3, 0.5e-3, 1.2e-3, 4.56e-3])
-def test_a_late_sensor_reads_what_was(tmp_path: Path, lag: float) -> None:
+def test_sensor_lag_delays_the_signal(tmp_path: Path, lag: float) -> None:
     nominal, _ = readings(tmp_path, None)
     late, signals = readings(tmp_path, effect("sensor_lag", "mass_disp_m", lag=lag))
     row = CARD.channels.index("mass_disp_m")
@@ -230,13 +228,13 @@ def test_gain_and_offset_come_after_the_tare(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.delete(values, ACC, 0), np.delete(nominal, ACC, 0))
 
 
-def test_a_sensor_that_the_rig_lacks_cannot_err(tmp_path: Path) -> None:
+def test_sensor_that_the_rig_lacks_cannot_err(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="sensor_gain") as error:
         machine(tmp_path, effect("sensor_gain", "rel_disp_m", gain=1.1))
     assert (error.value.key, error.value.value) == ("channel", "rel_disp_m")
 
 
-def test_the_damper_force_is_that_of_the_damper_alone(tmp_path: Path) -> None:
+def test_damper_force_is_that_of_the_damper_alone(tmp_path: Path) -> None:
     raw = CARD.model_dump()
     raw["sensors"] = [dict(sensor) for sensor in raw["sensors"]]
     raw["sensors"][7].update(channel="damper_force_n", noise_rms=0.0, offset=0.0)
@@ -284,7 +282,7 @@ def spelt(number: float) -> Iterator[bytes]:
     yield from (struct.pack(order, number) for order in ("<d", ">d"))
 
 
-def test_a_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path) -> None:
+def test_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path) -> None:
     keys = seal_truth(tmp_path, PHYSICS)
     card = tmp_path / "card.toml"
     card.write_text(CARD_TOML + "".join(f'{key} = "{value}"\n' for key, value in keys.items()))

@@ -202,7 +202,7 @@ def test_forces_less_the_nominal_ones_are_the_term_of_that_name(kind: EffectDefi
 
 
 @names(PHYSICAL)
-def test_an_adaptive_method_of_order_eight_finds_the_same_motion(kind: EffectDefinition) -> None:
+def test_adaptive_method_of_order_eight_finds_the_same_motion(kind: EffectDefinition) -> None:
     values = typical(kind) | {
         parameter.name: parameter.default for parameter in kind.parameters if parameter.default
     }
@@ -220,7 +220,7 @@ def test_an_adaptive_method_of_order_eight_finds_the_same_motion(kind: EffectDef
     assert np.abs(nominal[X] - out[X]).max() > 1e-6
 
 
-def test_the_integrator_is_of_fourth_order_through_contacts_with_many_laws() -> None:
+def test_integrator_is_of_fourth_order_through_contacts_with_many_laws() -> None:
     laws = HiddenCoefficients(
         k3=1e7, k5=3e10, ke=3e5, dead_width=1e-3, c2=2e3, c3=2e4, cu=3e6, k1=8e3, tau=0.05, k2=1e8,
         kc=4e10, ch=5e5, kb=2e5, tau_b=0.05, pull=50.0, gap_rate=1e-4, tilt=0.5,
@@ -256,7 +256,7 @@ def test_pressed_in_nonlinear_bumpers_rest(gaps: tuple[float, float]) -> None:
     np.testing.assert_allclose(out[DAMPER] + out[F_R] + out[F_L], 0.0, atol=1e-5)
 
 
-def test_the_base_of_a_truth_stands_in_place_of_the_cards() -> None:
+def test_base_of_a_truth_stands_in_place_of_the_cards() -> None:
     base: dict[str, Any] = {
         "mass_kg": 500.0, "damper_stiffness_n_m": 30e3, "damper_damping_n_s_m": 1e3,
         "bumper_stiffness_n_m": 4e5, "bumper_damping_n_s_m": 800.0, "gap_right_m": 1e-3,
@@ -268,7 +268,7 @@ def test_the_base_of_a_truth_stands_in_place_of_the_cards() -> None:
     )
 
 
-def test_a_law_too_fast_to_follow_is_refused_with_a_limit() -> None:
+def test_law_too_fast_to_follow_is_refused_with_a_limit() -> None:
     kind = next(definition for definition in EFFECT_DEFINITIONS if definition.id == "bouc_wen")
     with pytest.raises(InputError, match="2e-06 s") as error:
         with_effect(kind, {"force": 1.0, "yield_displacement": 1e-5, "exponent": 10.0})

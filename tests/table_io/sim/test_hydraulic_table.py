@@ -120,7 +120,7 @@ def find_linear_response(oil: HydraulicCoefficients, hz: float) -> complex:
 
 
 @pytest.mark.parametrize("hz", [0.5, 2.0, 6.0, 13.0, 20.0, 27.0, 40.0])
-def test_the_small_response_is_that_of_the_linear_table(hz: float) -> None:
+def test_small_response_is_that_of_the_linear_table(hz: float) -> None:
     plant = build_table(fc=0.0, fs=0.0)
     times = np.arange(12_000) / RATE_HZ
     rise = np.clip(times, 0.0, 1.0)
@@ -133,7 +133,7 @@ def test_the_small_response_is_that_of_the_linear_table(hz: float) -> None:
     assert abs(measured / spline / find_linear_response(plant.oil, hz) - 1.0) < 3e-3
 
 
-def test_a_shut_valve_leaves_the_mass_on_the_oil_column() -> None:
+def test_shut_valve_leaves_the_mass_on_the_oil_column() -> None:
     plant = build_table(
         fc=0.0, fs=0.0, gain=0.0, feedforward=0.0, pressure_gain=0.0, frame_mass=1e9
     )
@@ -148,7 +148,7 @@ def test_a_shut_valve_leaves_the_mass_on_the_oil_column() -> None:
 
 
 @pytest.mark.parametrize(("share", "is_stuck"), [(0.9, True), (1.2, False)])
-def test_the_table_sticks_below_the_static_friction(share: float, is_stuck: bool) -> None:
+def test_table_sticks_below_the_static_friction(share: float, is_stuck: bool) -> None:
     """Under a pressure that the shut valve holds the table rests, or slides on."""
     plant = build_table(gain=0.0, pressure_gain=0.0, feedforward=0.0, leakage=0.0, s1=2e5)
     assert plant.oil is not None
@@ -162,7 +162,7 @@ def test_the_table_sticks_below_the_static_friction(share: float, is_stuck: bool
     assert abs(state[BRISTLE]) <= 1.001 * oil.fs / oil.s0
 
 
-def test_the_open_valve_bounds_the_speed_and_the_supply_the_pressure() -> None:
+def test_open_valve_bounds_the_speed_and_the_supply_the_pressure() -> None:
     plant = build_table(fc=0.0, fs=0.0, viscous=0.0, leakage=0.0, pressure_gain=0.0)
     state = plant.rest_state()
     signals = play(plant, np.full(150, 10.0), state)  # far away: the valve opens
@@ -216,6 +216,6 @@ def test_less_supply_is_less_force() -> None:
 
 
 @pytest.mark.parametrize("given", [{"servo_bandwidth_hz": 20.0}, {"hydraulic": None}])
-def test_what_moves_the_table_is_stated_once(given: dict[str, float | None]) -> None:
+def test_actuator_is_stated_once(given: dict[str, float | None]) -> None:
     with pytest.raises(ValidationError, match="not stated once"):
         SimulatedTableConfig.model_validate(CONFIG.model_dump() | given)

@@ -73,7 +73,7 @@ def test_each_definition_states_sizes_and_a_source(definition: ImperfectionDefin
         (entry("hum", "x = 1", rms=1.0), r"imperfections.0.x: unknown key"),
     ],
 )
-def test_an_imperfection_that_makes_no_sense_is_refused(text: str, message: str) -> None:
+def test_imperfection_that_makes_no_sense_is_refused(text: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         parse_toml(text, GroundTruth, "truth.toml")
 
@@ -88,7 +88,7 @@ def test_defaults_are_completed_and_infinity_is_a_number() -> None:
     assert not sharing.is_absent
 
 
-def test_an_entry_of_one_side_wins() -> None:
+def test_entry_of_one_side_wins() -> None:
     text = entry("plate_mass", 'side = "left"', mass=5.0) + entry("plate_mass", mass=1.0)
     plates = resolve_sides(parse_toml(text, GroundTruth, "x").imperfections, "plate_mass")
     assert plates == {"right": {"mass": 1.0}, "left": {"mass": 5.0}}
@@ -98,7 +98,7 @@ def sizes(laboratory: list[Imperfection], name: str, parameter: str) -> list[flo
     return [e.parameters[parameter] for e in laboratory if e.id == name]
 
 
-def test_a_drawn_laboratory_has_everything_everywhere_and_is_a_ground_truth() -> None:
+def test_drawn_laboratory_has_everything_everywhere_and_is_a_ground_truth() -> None:
     laboratory = draw_laboratory("typical", np.random.default_rng(3))
     assert GroundTruth(imperfections=tuple(laboratory)).imperfections == tuple(laboratory)
     assert {e.id for e in laboratory} == set(IMPERFECTION_IDS)

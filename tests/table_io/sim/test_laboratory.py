@@ -122,7 +122,7 @@ def take_samples(backend: SimulatedBackend, cuts: list[int], frequency: float = 
 
 
 @pytest.mark.parametrize("level", ["typical", "bad"])
-def test_the_division_into_reads_changes_no_bit(tmp_path: Path, level: str) -> None:
+def test_division_into_reads_changes_no_bit(tmp_path: Path, level: str) -> None:
     entries = draw_laboratory(level, np.random.default_rng(5))  # type: ignore[arg-type]
     assert {e.id for e in entries} == set(IMPERFECTION_IDS)
     whole = take_samples(machine(tmp_path, entries), [2600])
@@ -164,7 +164,7 @@ ON_THE_MOTION = ("table_pitch", "mass_reading", "gap_reading", "time_base")
     [d for d in IMPERFECTION_DEFINITIONS if d.id not in ON_THE_MOTION],
     ids=lambda d: f"{d.id}-{d.form}",
 )
-def test_a_tiny_imperfection_does_next_to_nothing_and_a_bad_one_something(
+def test_tiny_imperfection_does_next_to_nothing_and_a_bad_one_something(
     definition: ImperfectionDefinition,
 ) -> None:
     t = np.arange(4000) / RATE_HZ
@@ -192,7 +192,7 @@ def test_a_tiny_imperfection_does_next_to_nothing_and_a_bad_one_something(
     assert (bad.max(axis=1) > 1e-5 * scale).any()
 
 
-def test_a_channel_that_the_rig_lacks_or_that_does_not_fit_is_refused() -> None:
+def test_channel_that_the_rig_lacks_or_that_does_not_fit_is_refused() -> None:
     for name, channel in (("hum", "rel_disp_m"), ("highpass", "mass_disp_m")):
         size = {"rms": 1.0} if name == "hum" else {"corner_hz": 1.0}
         with pytest.raises(InputError) as error:
@@ -204,7 +204,7 @@ def test_a_channel_that_the_rig_lacks_or_that_does_not_fit_is_refused() -> None:
         laboratory(imperfection("light_spot", channel="drive_disp_m", rms=1e-6))
 
 
-def test_an_entry_of_a_channel_wins_and_the_command_must_be_stated() -> None:
+def test_entry_of_a_channel_wins_and_the_command_must_be_stated() -> None:
     entries = [
         imperfection("drift", channel="mass_disp_m", offset_per_h=36.0),
         imperfection("drift", offset_per_h=3.6),
@@ -243,7 +243,7 @@ def test_cells_share_the_contact_force_by_position_and_bear_the_plate() -> None:
     np.testing.assert_allclose(cells["force_l1_n"], -0.4 * left + 2.5 * y_acc, rtol=1e-12)
 
 
-def test_a_share_stays_within_0_and_1() -> None:
+def test_share_stays_within_0_and_1() -> None:
     signals = np.zeros((6, 2))
     signals[2], signals[4] = [1.0, -1.0], 100.0
     cells = laboratory(imperfection("load_sharing", share_per_m=2.0)).cell_forces(signals)
@@ -256,7 +256,7 @@ def test_a_share_stays_within_0_and_1() -> None:
 
 @pytest.mark.parametrize(("form", "order"), [("butterworth", 1), ("butterworth", 3),
     ("butterworth", 8), ("bessel", 2), ("bessel", 5), ("bessel", 8)])  # fmt: skip
-def test_an_anti_alias_filter_has_the_response_of_its_prototype(form: str, order: int) -> None:
+def test_anti_alias_filter_has_the_response_of_its_prototype(form: str, order: int) -> None:
     rate, corner = 50e3, 100.0  # so fast that lines between samples are no error
     entry = imperfection("anti_alias_filter", form=form, order=order, corner_hz=corner)
     prototype = signal.butter if form == "butterworth" else signal.bessel
@@ -330,7 +330,7 @@ def test_filtered_noise_is_stationary_from_the_first_sample() -> None:
     assert np.std(later) < 0.4
 
 
-def test_a_low_cut_forgets_a_step() -> None:
+def test_low_cut_forgets_a_step() -> None:
     step = np.ones(4000)
     step[0] = 0.0
     out = measured(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=step)
@@ -342,7 +342,7 @@ def test_a_low_cut_forgets_a_step() -> None:
     np.testing.assert_allclose(constant[ROW["mass_acc_m_s2"]], 0.0, atol=1e-12)
 
 
-def test_the_low_cut_has_its_corner() -> None:
+def test_low_cut_has_its_corner() -> None:
     t = np.arange(40000) / RATE_HZ
     line = np.sin(TURN * 2.0 * t)
     out = measured(imperfection("highpass", corner_hz=0.5), table_acc_m_s2=line)
@@ -350,7 +350,7 @@ def test_the_low_cut_has_its_corner() -> None:
     assert response == pytest.approx(1.0 / (1.0 - 0.25j), abs=1e-5)
 
 
-def test_a_bracket_resonates() -> None:
+def test_bracket_resonates() -> None:
     rate, natural, damping = 20e3, 300.0, 0.05
     t = np.arange(20000) / rate
     entry = imperfection("mounting_resonance", frequency=natural, damping_ratio=damping)
@@ -363,7 +363,7 @@ def test_a_bracket_resonates() -> None:
         assert abs(response / expected - 1.0) < 6e-3
 
 
-def test_a_cable_errs_on_impacts_and_forgets() -> None:
+def test_cable_errs_on_impacts_and_forgets() -> None:
     signals = np.zeros((6, 3000))
     signals[4, 1:] = 1000.0
     entry = imperfection("cable", channel="mass_acc_m_s2", error_per_n=1e-4, decay_time=0.2)
@@ -403,7 +403,7 @@ def test_low_bits_leave_coarse_steps(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.delete(coarse, row, 0), np.delete(plain, row, 0))
 
 
-def test_the_time_base_makes_the_motion_faster_than_stated(tmp_path: Path) -> None:
+def test_time_base_makes_the_motion_faster_than_stated(tmp_path: Path) -> None:
     def ratio(deviation: float) -> float:
         backend = machine(
             tmp_path, [imperfection("time_base", deviation=deviation)], noise_rms=0.0, offset=0.0
@@ -487,7 +487,7 @@ def test_drift_is_a_line_and_an_exponential_and_a_gain() -> None:
 # Lasers
 
 
-def test_a_laser_is_not_linear() -> None:
+def test_laser_is_not_linear() -> None:
     full_scale = RIG.sensors[ROW["mass_disp_m"]].range_si
     s = np.linspace(-1.2, 1.2, 201)
     entry = imperfection("laser_nonlinearity", share=2e-3, even_share=1e-3)
@@ -502,7 +502,7 @@ def test_a_laser_is_not_linear() -> None:
     np.testing.assert_array_equal(out[ROW["mass_acc_m_s2"]], s)
 
 
-def test_a_light_spot_reads_the_same_error_at_the_same_place() -> None:
+def test_light_spot_reads_the_same_error_at_the_same_place() -> None:
     entry = imperfection("light_spot", rms=3e-6, correlation_length=2e-4)
     x = np.linspace(-0.09, 0.09, 90_001)  # steps of 2 um
     out = measured(entry, mass_disp_m=x, table_disp_m=x)
@@ -548,7 +548,7 @@ def test_accelerometers_feel_the_vertical_motion() -> None:
     assert abs(amplitude(cross, pitch) / expected - 1) < 1e-3
 
 
-def test_a_pitching_table_pushes_the_mass_and_tilts_the_accelerometers(tmp_path: Path) -> None:
+def test_pitching_table_pushes_the_mass_and_tilts_the_accelerometers(tmp_path: Path) -> None:
     entry = imperfection("table_pitch", per_acceleration=2e-3, per_travel=0.5)
     backend = machine(tmp_path, [entry], noise_rms=0.0, offset=0.0)
     recorded: list[Float2D] = []
@@ -592,7 +592,7 @@ def test_mass_and_gaps_were_misread() -> None:
 # Tare
 
 
-def test_the_tare_sees_what_sensors_read_at_rest(tmp_path: Path) -> None:
+def test_tare_reads_sensors_at_rest(tmp_path: Path) -> None:
     entries = [
         imperfection("light_spot", rms=5e-4, correlation_length=5e-3),
         imperfection("hum", channel="mass_acc_m_s2", rms=0.05),

@@ -138,7 +138,7 @@ def desk(tmp_path: Path) -> Desk:
     return Desk(tmp_path)
 
 
-def test_a_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(desk: Desk) -> None:
+def test_silent_controller_is_lost_in_time_and_what_is_queued_plays_to_rest(desk: Desk) -> None:
     volts = sine(1.0)
     desk.drive(volts)
     desk.wait(0.5)
@@ -169,7 +169,7 @@ def test_signs_of_life_keep_it(desk: Desk) -> None:
     assert not desk.table.latched_reason
 
 
-def test_a_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: Desk) -> None:
+def test_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: Desk) -> None:
     volts = sine(1.0)
     desk.drive(volts[:1200])
     desk.wait(0.5)
@@ -185,7 +185,7 @@ def test_a_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: 
     assert acceleration(life.command_m) <= 1.05 * acceleration(volts / SCALE)
 
 
-def test_what_is_held_off_the_mean_goes_home_once_nobody_holds_it(desk: Desk) -> None:
+def test_table_off_its_mean_returns_after_release(desk: Desk) -> None:
     x = np.linspace(0.0, 1.0, 1000)
     desk.drive(np.append(x**3 * (10.0 + x * (-15.0 + 6.0 * x)), 1.0))
     desk.wait(1.0)
@@ -197,7 +197,7 @@ def test_what_is_held_off_the_mean_goes_home_once_nobody_holds_it(desk: Desk) ->
     assert acceleration(life.command_m) < 0.55
 
 
-def test_a_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(desk: Desk) -> None:
+def test_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(desk: Desk) -> None:
     x = np.clip(np.arange(1000) / 998, 0.0, 1.0)
     volts = np.concatenate([np.zeros(1500), 64.0 * (x * (1.0 - x)) ** 3])
     desk.drive(volts)
@@ -209,7 +209,7 @@ def test_a_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(des
     assert life.notes[-1][0] >= 2500 + 0.2 * RATE_HZ
 
 
-def test_a_table_without_oil_pressure_is_given_the_time_that_it_needs(tmp_path: Path) -> None:
+def test_table_without_oil_pressure_is_given_the_time_that_it_needs(tmp_path: Path) -> None:
     desk = Desk(tmp_path, TEXT + OIL_LOSS)
     desk.drive(sine(4.0, f=1.0))
     desk.wait(4.0)
@@ -230,7 +230,7 @@ def test_time_that_passed_without_a_tick_is_past(desk: Desk) -> None:
     assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.VALUE)
 
 
-def test_nobody_else_gets_a_table_that_moves(desk: Desk) -> None:
+def test_moving_table_is_refused_to_others(desk: Desk) -> None:
     assert desk.table.busy_refusal() is None
     desk.drive(sine(1.0))
     busy = desk.table.busy_refusal()
@@ -252,7 +252,7 @@ def test_nobody_else_gets_a_table_that_moves(desk: Desk) -> None:
     assert lives[1].notes[0] == (0, "claimed; controller lost at sample 1201: gone")
 
 
-def test_who_goes_before_the_start_leaves_it_free(desk: Desk) -> None:
+def test_claim_without_start_is_given_up(desk: Desk) -> None:
     desk.say(claim(), values_message(MessageKind.QUEUE, sine(1.0)))
     desk.wait(29.0, beats=False)
     assert desk.table.is_claimed
@@ -275,9 +275,7 @@ def test_who_goes_before_the_start_leaves_it_free(desk: Desk) -> None:
         (claim(rate_hz=1e300), "allowed: 1000, 2000, 4000"),
     ],
 )
-def test_a_claim_that_does_not_fit_is_refused(
-    desk: Desk, message: MachineMessage, why: str
-) -> None:
+def test_claim_that_does_not_fit_is_refused(desk: Desk, message: MachineMessage, why: str) -> None:
     (answer,) = desk.say(message)
     assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.INPUT)
     assert re.search(why, answer.text)
@@ -297,7 +295,7 @@ def test_a_claim_that_does_not_fit_is_refused(
         claim(sensors=[]),
     ],
 )
-def test_a_claim_that_is_none_is_garbage(desk: Desk, message: MachineMessage) -> None:
+def test_invalid_claim_is_refused(desk: Desk, message: MachineMessage) -> None:
     with pytest.raises(ProtocolError):
         desk.say(message)
     assert not desk.table.is_claimed
@@ -319,7 +317,7 @@ def test_a_claim_that_is_none_is_garbage(desk: Desk, message: MachineMessage) ->
         (MachineMessage(MessageKind.START), Refusal.ORDER),
     ],
 )
-def test_nonsense_does_not_reach_the_table(
+def test_invalid_message_changes_nothing(
     desk: Desk, message: MachineMessage, refusal: Refusal | None
 ) -> None:
     volts = sine(1.0)
@@ -344,7 +342,7 @@ def test_nonsense_does_not_reach_the_table(
     st.integers(-(2**63), 2**63 - 1),
     st.one_of(st.binary(max_size=64), st.floats().map(lambda x: np.array([x]).tobytes())),
 )
-def test_whatever_is_said_the_table_answers_or_calls_it_garbage(
+def test_any_message_is_answered_or_refused(
     tmp_path_factory: pytest.TempPathFactory, kind: MessageKind, index: int, payload: bytes
 ) -> None:
     desk = Desk(tmp_path_factory.mktemp("desk"))
@@ -357,7 +355,7 @@ def test_whatever_is_said_the_table_answers_or_calls_it_garbage(
             desk.wait(0.02)
 
 
-def test_a_command_far_ahead_does_not_fill_the_memory(desk: Desk) -> None:
+def test_command_far_ahead_does_not_fill_the_memory(desk: Desk) -> None:
     desk.drive(sine(1.0))
     (answer,) = desk.say(values_message(MessageKind.QUEUE, np.zeros(2), 2**62))
     assert (answer.kind, answer.index) == (MessageKind.REFUSED, Refusal.VALUE)
@@ -380,7 +378,7 @@ def test_late_samples_are_handed_over_late_and_in_order(tmp_path: Path) -> None:
     assert after - 100.0 - 801 / RATE_HZ < 2 * TICK_S
 
 
-def test_a_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None:
+def test_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None:
     desk = Desk(tmp_path, TEXT + STALL)
     desk.drive(sine(1.0))
     desk.wait(0.6)
@@ -393,7 +391,7 @@ def test_a_machine_that_stalls_still_plays_and_remembers(tmp_path: Path) -> None
     assert life.command_m[-1] == 0.0
 
 
-def test_a_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
+def test_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
     desk.drive(sine(1.0))
     desk.wait(0.5)
     path = desk.folder / "box"
@@ -406,7 +404,7 @@ def test_a_black_box_that_is_cut_off_is_readable(desk: Desk) -> None:
     np.testing.assert_array_equal(life.samples, whole[:, :count])
 
 
-def test_a_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -> None:
+def test_black_box_overwrites_nothing_and_names_what_is_none(tmp_path: Path) -> None:
     path = tmp_path / "box"
     path.write_text("something else, long enough for a header")
     before = path.read_bytes()

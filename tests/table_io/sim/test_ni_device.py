@@ -108,7 +108,7 @@ def code_of(call: Callable[[], object]) -> int:
 RAMP = np.arange(1000) / 1000.0
 
 
-def test_the_output_waits_for_the_trigger_of_the_input_and_shares_its_sample_0() -> None:
+def test_output_waits_for_the_trigger_of_the_input_and_shares_its_sample_0() -> None:
     bank = Bank()
     bank.write(0, RAMP)
     bank.device.start(bank.output, START_S)
@@ -119,7 +119,7 @@ def test_the_output_waits_for_the_trigger_of_the_input_and_shares_its_sample_0()
     assert (bank.device.read(bank.input, 200)[0] == RAMP[:200]).all()
 
 
-def test_what_lies_in_the_buffer_is_replaced_and_what_lies_in_the_device_is_not() -> None:
+def test_only_samples_in_the_buffer_are_replaced() -> None:
     bank = Bank()
     bank.go(RAMP)
     now_s = START_S + 0.1  # 201 samples have left, the next 40 lie in the device
@@ -161,7 +161,7 @@ def test_with_regeneration_it_begins_anew() -> None:
     assert not bank.device.is_done(bank.output, START_S + 1.2)
 
 
-def test_what_lies_behind_the_last_write_is_forgotten() -> None:
+def test_samples_behind_the_last_write_are_dropped() -> None:
     bank = Bank()
     bank.go(RAMP)
     bank.write(300, np.ones(10), START_S + 0.05)
@@ -169,7 +169,7 @@ def test_what_lies_behind_the_last_write_is_forgotten() -> None:
     assert bank.table.why == "output ran out at sample 310"
 
 
-def test_a_buffer_has_an_end_and_no_hole() -> None:
+def test_buffer_has_an_end_and_no_hole() -> None:
     bank = Bank()
     assert code_of(lambda: bank.write(0, np.zeros(10001))) == ErrorCode.NO_MORE_SPACE
     bank.go(RAMP)
@@ -178,13 +178,13 @@ def test_a_buffer_has_an_end_and_no_hole() -> None:
     assert code_of(lambda: bank.write(-1, np.zeros(10), START_S)) == ErrorCode.NEGATIVE_WRITE
 
 
-def test_an_output_needs_samples_before_it_starts() -> None:
+def test_output_needs_samples_before_it_starts() -> None:
     bank = Bank()
     bank.write(0, np.zeros(HELD_SAMPLES - 1))
     assert code_of(lambda: bank.device.start(bank.output, START_S)) == ErrorCode.NOT_ENOUGH_WRITTEN
 
 
-def test_an_input_that_nobody_reads_ends_and_the_output_goes_on() -> None:
+def test_input_that_nobody_reads_ends_and_the_output_goes_on() -> None:
     bank = Bank()
     bank.go(np.tile(RAMP, 9))
     late = START_S + 4001 / RATE_HZ
@@ -196,7 +196,7 @@ def test_an_input_that_nobody_reads_ends_and_the_output_goes_on() -> None:
     assert not bank.device.is_done(bank.output, late)
 
 
-def test_an_output_on_the_clock_of_the_inputs_freezes_with_them() -> None:
+def test_output_on_the_clock_of_the_inputs_freezes_with_them() -> None:
     bank = Bank(clock="/Dev1/ai/SampleClock")
     bank.go(np.tile(RAMP, 9))
     bank.device.stop(bank.input, START_S + 0.25)
@@ -204,7 +204,7 @@ def test_an_output_on_the_clock_of_the_inputs_freezes_with_them() -> None:
     assert bank.table.take_played(3000)[-1] == RAMP[500]
 
 
-def test_an_output_that_is_stopped_freezes_where_it_is() -> None:
+def test_output_that_is_stopped_freezes_where_it_is() -> None:
     bank = Bank()
     bank.go(RAMP)
     bank.device.clear(bank.output, START_S + 0.25)
@@ -221,7 +221,7 @@ def test_samples_are_waited_for_and_read_once() -> None:
     assert (whole[0] == RAMP[:100]).all()
 
 
-def test_a_device_that_is_in_use_is_reserved_and_a_session_is_found_by_its_name() -> None:
+def test_device_that_is_in_use_is_reserved_and_a_session_is_found_by_its_name() -> None:
     bank = Bank()
     bank.go(RAMP)
     other = bank.device.create_task("other", 1)[0]
@@ -235,7 +235,7 @@ def test_a_device_that_is_in_use_is_reserved_and_a_session_is_found_by_its_name(
         bank.device.create_task("nobody", 2)
 
 
-def test_a_rate_that_the_device_has_not_and_a_task_without_channels_are_refused() -> None:
+def test_rate_that_the_device_has_not_and_a_task_without_channels_are_refused() -> None:
     bank = Bank()
     assert (
         code_of(lambda: bank.device.configure_timing(bank.input, 1234.5, "", 10))

@@ -97,7 +97,7 @@ def test_both_branches_at_3_4_hz_and_4_mm(start: float, u_mm: float) -> None:
 
 
 @pytest.mark.parametrize("toward", [1.0, -1.0])
-def test_a_touch_from_zero_gap_follows_the_closed_form_of_the_contact(toward: float) -> None:
+def test_touch_from_zero_gap_follows_the_closed_form_of_the_contact(toward: float) -> None:
     plant = replace(RIG, gap_right_m=0.0, gap_left_m=0.0, substep_s=1e-4)
     state = plant.rest_state()
     state[1] = 0.1 * toward
@@ -152,7 +152,7 @@ def test_energy_lost_is_the_work_of_the_dashpots() -> None:
     assert lost == pytest.approx(np.trapezoid(power, dx=1 / rate), abs=0.5 * jumps / rate)
 
 
-def test_a_bumper_pushes_and_never_pulls_and_the_mass_obeys_newton() -> None:
+def test_bumper_pushes_and_never_pulls_and_the_mass_obeys_newton() -> None:
     plant = replace(RIG, rate_hz=4000.0)
     out = run(plant, sine(plant, 1.1, 5.0))
     assert out[F_R].min() == 0.0 < out[F_R].max()
@@ -167,7 +167,7 @@ def test_a_bumper_pushes_and_never_pulls_and_the_mass_obeys_newton() -> None:
     assert np.abs(balance[smooth][1:-1]).max() < 0.5
 
 
-def test_a_released_face_remembers() -> None:
+def test_released_face_remembers() -> None:
     plant = replace(RIG, bumper_damping_n_s_m=KJ * 0.2)  # relaxes in 0.2 s
     state = plant.rest_state()
     state[1] = 0.3
@@ -198,7 +198,7 @@ def test_equal_precompression_bears_k_times_p_on_both_sides() -> None:
     assert out[F_L, -1] == pytest.approx(-510.0)
 
 
-def test_the_integrator_is_of_fourth_order_through_contacts() -> None:
+def test_integrator_is_of_fourth_order_through_contacts() -> None:
     command = sine(RIG, 3.4, 0.5, acc=2.0)
 
     def ends(parts: int) -> Float2D:
@@ -238,7 +238,7 @@ def test_table_acceleration_is_the_motion_and_has_no_sample_ripple() -> None:
     assert np.abs(out[Y_ACC] - fitted).max() < 1e-4 * A
 
 
-def test_the_specimen_pushes_the_table_back() -> None:
+def test_specimen_pushes_the_table_back() -> None:
     plant = replace(RIG, payload_reaction=True)
     state = plant.rest_state()
     state[0], state[1] = 10e-3, 0.0  # mass right of the table: the damper pulls the table right
@@ -252,7 +252,7 @@ def test_the_specimen_pushes_the_table_back() -> None:
     np.testing.assert_allclose(on_table[5:-5], -M * out[X_ACC][5:-5], atol=2.0)
 
 
-def test_the_cut_into_calls_changes_no_bit() -> None:
+def test_cut_into_calls_changes_no_bit() -> None:
     plant = replace(RIG, payload_reaction=True, servo_delay_s=0.00537)
     command = sine(plant, 1.4, 3.0)
     whole = run(plant, command)
@@ -267,13 +267,13 @@ def test_the_cut_into_calls_changes_no_bit() -> None:
         assert parts.tobytes() == whole.tobytes(), samples
 
 
-def test_a_bumper_too_fast_to_follow_is_refused_with_a_limit() -> None:
+def test_bumper_too_fast_to_follow_is_refused_with_a_limit() -> None:
     with pytest.raises(InputError) as error:
         replace(RIG, bumper_damping_n_s_m=0.1)
     assert (error.value.key, error.value.value) == ("bumper_damping_n_s_m", 0.1)
     assert error.value.allowed.startswith("at least 5.1")
 
 
-def test_a_command_that_does_not_span_the_output_is_refused() -> None:
+def test_command_that_does_not_span_the_output_is_refused() -> None:
     with pytest.raises(ValueError, match="does not span"):
         RIG.advance(RIG.rest_state(), np.zeros(3), np.empty((7, 10)))

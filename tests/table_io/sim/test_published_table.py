@@ -57,7 +57,7 @@ def build_published_system() -> signal.TransferFunction:
 
 
 @pytest.mark.parametrize("hz", [0.5, 2.0, 5.0, 10.0, 20.0, 40.0, 60.0, 80.0])
-def test_the_frequency_response_is_the_published_one(hz: float) -> None:
+def test_frequency_response_is_the_published_one(hz: float) -> None:
     times = np.arange(round(RATE_HZ * max(2.0, 4.0 / hz))) / RATE_HZ
     command = 1e-3 * np.clip(times / 0.5, 0.0, 1.0) * np.sin(math.tau * hz * times)
     tail = slice(-round(RATE_HZ * max(1.0, 2.0 / hz)), None)
@@ -69,7 +69,7 @@ def test_the_frequency_response_is_the_published_one(hz: float) -> None:
     assert abs(measured / (expected[0] * delay) - 1.0) < 1e-3
 
 
-def test_the_step_response_is_the_published_one() -> None:
+def test_step_response_is_the_published_one() -> None:
     times = np.arange(round(0.5 * RATE_HZ)) / RATE_HZ
     position = play(build_published_table(), np.full(times.size, 1e-3))[0]
     _, expected = signal.step(build_published_system(), T=times)

@@ -72,13 +72,13 @@ def test_every_clock_sees_the_same_samples_and_the_real_one_keeps_time() -> None
     assert real.tobytes() == fast.tobytes()
 
 
-def test_the_seed_decides_the_noise() -> None:
+def test_seed_decides_the_noise() -> None:
     samples = play_run(command(0.1), [200])
     assert play_run(command(0.1), [200], card=rig(seed=1)).tobytes() == samples.tobytes()
     assert play_run(command(0.1), [200], card=rig(seed=2)).tobytes() != samples.tobytes()
 
 
-def test_the_command_is_played_in_steps_and_held_at_the_rails() -> None:
+def test_command_is_played_in_steps_and_held_at_the_rails() -> None:
     raw = RIG.model_dump()
     raw["output"]["bits"] = 12
     step_m = 2 * 60e-3 / 2**12
@@ -120,7 +120,7 @@ def test_noise_is_white_and_of_its_own_in_every_channel() -> None:
     assert np.abs(correlation - np.eye(len(correlation))).max() < 5 / np.sqrt(20000)
 
 
-def test_what_was_tared_reads_the_truth_with_precompression() -> None:
+def test_tared_sensors_read_precompression() -> None:
     specimen = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": -2.0})
     machine = backend(specimen=specimen)
     tare = compute_tare(machine.tare(20000), RIG.sensors)
@@ -141,7 +141,7 @@ def test_taring_does_not_change_the_run() -> None:
     assert machine.read(200).tobytes() == play_run(command(0.1), [200]).tobytes()
 
 
-def test_the_cells_of_a_side_share_its_force_in_compression() -> None:
+def test_cells_of_a_side_share_its_force_in_compression() -> None:
     samples = play_run(command(2.0), [4000], card=sensors(noise_rms=0.0, offset=0.0))
     values = volts_to_si(samples, RIG.sensors, {})
     cells = values[5:]
@@ -157,7 +157,7 @@ def test_the_cells_of_a_side_share_its_force_in_compression() -> None:
     assert np.median(np.abs(lost)) < 0.5
 
 
-def test_the_queue_does_not_grow_with_the_test() -> None:
+def test_queue_does_not_grow_with_the_test() -> None:
     machine = backend()
     machine.queue(0, np.zeros(1000))
     machine.start()

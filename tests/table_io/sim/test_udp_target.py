@@ -251,7 +251,7 @@ def desk(request: pytest.FixtureRequest, tmp_path: Path) -> Desk:
     return Desk(request.param(tmp_path))
 
 
-def test_a_command_is_replaced_at_once_and_whole(desk: Desk) -> None:
+def test_command_is_replaced_at_once_and_whole(desk: Desk) -> None:
     volts, other = sine(1.0), np.linspace(0.0, 0.0, 700)
     desk.drive(volts)
     desk.wait(0.1)
@@ -274,7 +274,7 @@ def test_a_command_is_replaced_at_once_and_whole(desk: Desk) -> None:
     check_played(desk, whole[:1300])
 
 
-def test_a_command_that_never_arrives_whole_changes_nothing(desk: Desk) -> None:
+def test_command_that_never_arrives_whole_changes_nothing(desk: Desk) -> None:
     volts = sine(1.0)
     desk.drive(volts)
     desk.queue(400, np.full(700, 0.5), leave_out=3)
@@ -289,7 +289,7 @@ def test_a_command_that_never_arrives_whole_changes_nothing(desk: Desk) -> None:
 
 
 @pytest.mark.parametrize("bad", ["late", "nan", "long", "far", "negative"])
-def test_a_command_that_cannot_be_played_is_refused_whole(desk: Desk, bad: str) -> None:
+def test_command_that_cannot_be_played_is_refused_whole(desk: Desk, bad: str) -> None:
     volts = sine(1.0)
     desk.drive(volts)
     index, command, verdict = 300, np.full(200, 0.5), QueueVerdict.NONSENSE
@@ -331,7 +331,7 @@ def test_more_than_the_output_has_is_refused_whole(desk: Desk, volts: float) -> 
         (59.99, 1.5, 0.2), (59.99, 1.5, 0.23),
     ],
 )  # fmt: skip
-def test_a_large_motion_is_landed_within_the_span(
+def test_large_motion_is_landed_within_the_span(
     desk: Desk, mm: float, f: float, turn: float
 ) -> None:
     """The same in both: the landing of `command_buffer.py`."""
@@ -348,7 +348,7 @@ def test_a_large_motion_is_landed_within_the_span(
     assert not played[volts.size + landed.size :].any()
 
 
-def test_a_gap_between_two_queues_holds_the_last_value_whatever_was_played_before(
+def test_gap_between_two_queues_holds_the_last_value_whatever_was_played_before(
     desk: Desk,
 ) -> None:
     desk.drive(np.append(sine(2.2, 3.0), np.zeros(4000)))
@@ -392,7 +392,7 @@ int main(void) {
 """
 
 
-def test_the_heartbeat_beats_on_after_years(tmp_path: Path) -> None:
+def test_heartbeat_beats_on_after_years(tmp_path: Path) -> None:
     build_target()  # or skip
     source, program = tmp_path / "aged.c", tmp_path / "aged"
     source.write_text(AGED)
@@ -408,7 +408,7 @@ def test_before_the_start_a_whole_ring_can_be_filled_and_no_more(desk: Desk) -> 
     assert desk.queue(0, np.linspace(0.0, 1e-3, RING_SAMPLES)).verdict is QueueVerdict.PLAYS
 
 
-def test_a_silent_rig_is_lost_in_time_and_the_table_comes_to_rest(desk: Desk) -> None:
+def test_silent_rig_is_lost_in_time_and_the_table_comes_to_rest(desk: Desk) -> None:
     volts = sine(0.8)
     desk.drive(volts)
     desk.wait(0.2)
@@ -423,7 +423,7 @@ def test_a_silent_rig_is_lost_in_time_and_the_table_comes_to_rest(desk: Desk) ->
     assert played.size < volts.size + 8 * RATE_HZ
 
 
-def test_what_is_held_off_the_mean_goes_home_once_it_is_released(desk: Desk) -> None:
+def test_table_off_its_mean_returns_after_release(desk: Desk) -> None:
     x = np.linspace(0.0, 1.0, 1000)
     desk.drive(np.append(x**3 * (10 + x * (-15 + 6 * x)), 1.0))
     desk.wait(1.0)
@@ -436,7 +436,7 @@ def test_what_is_held_off_the_mean_goes_home_once_it_is_released(desk: Desk) -> 
     assert acceleration(played) < 0.55
 
 
-def test_an_old_word_come_again_is_no_sign_of_life(desk: Desk) -> None:
+def test_old_word_come_again_is_no_sign_of_life(desk: Desk) -> None:
     desk.drive(sine(1.0))
     old = encode_rig_packet(
         RigPacket(PacketKind.BEAT, session=desk.session, sequence=desk.sequence)
@@ -504,7 +504,7 @@ def test_samples_are_sent_again_where_they_are_asked_for(desk: Desk) -> None:
         (lambda desk: desk.claim(channels=8), Reason.CHANNELS),
     ],
 )
-def test_a_claim_that_does_not_fit_is_refused(
+def test_claim_that_does_not_fit_is_refused(
     desk: Desk, claim: Callable[[Desk], None], reason: Reason
 ) -> None:
     claim(desk)
@@ -522,7 +522,7 @@ def test_another_machine_card_is_refused(tmp_path: Path) -> None:
     assert desk.wait(TICK_S).session == desk.session
 
 
-def test_a_session_that_has_ended_claims_no_more(desk: Desk) -> None:
+def test_session_that_has_ended_claims_no_more(desk: Desk) -> None:
     desk.drive(sine(0.3, 0.1))
     desk.say(RigPacket(PacketKind.RELEASE))
     desk.rest()
@@ -535,7 +535,7 @@ def test_a_session_that_has_ended_claims_no_more(desk: Desk) -> None:
     check_played(desk, sine(0.3, 0.2)[:200])
 
 
-def test_a_silent_claim_is_given_up(desk: Desk) -> None:
+def test_silent_claim_is_given_up(desk: Desk) -> None:
     desk.claim()
     desk.wait(TICK_S)
     assert desk.wait(29.9, beats=False).phase is Phase.CLAIMED
@@ -573,7 +573,7 @@ FUZZ = settings(max_examples=6, suppress_health_check=[HealthCheck.function_scop
 
 @FUZZ
 @given(st.lists(MAD, max_size=8), st.binary(max_size=1200))
-def test_whatever_strangers_say_it_plays_on(
+def test_packets_of_strangers_change_nothing(
     desk: Desk, words: list[RigPacket], data: bytes
 ) -> None:
     desk.session, desk.sequence, desk.queues = desk.session + 10, 0, 0
@@ -593,7 +593,7 @@ def test_whatever_strangers_say_it_plays_on(
 @FUZZ
 @given(words=st.lists(MAD, max_size=8))
 @pytest.mark.parametrize("kind", [PythonFar, CFar])
-def test_a_rig_that_lost_its_mind_does_no_harm(
+def test_invalid_packets_of_the_rig_do_no_harm(
     kind: Callable[[Path], Far], tmp_path: Path, words: list[RigPacket]
 ) -> None:
     """Its commands are taken or refused, and it is still heard."""
