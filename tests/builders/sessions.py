@@ -10,7 +10,7 @@ import numpy as np
 
 from table_io.acquisition.session import OperatorCommand, SessionSetup, run_session
 from table_io.backends import Backend, open_backend
-from table_io.block import Block, join_blocks
+from table_io.block import Block, Float1D, join_blocks
 from table_io.clock import ManualClock
 from table_io.config.calibration import command_to_volts, compute_tare, measure_noise, volts_to_si
 from table_io.config.profile import Profile
@@ -75,6 +75,16 @@ class PlayedSession:
         return join_blocks(self.select(Block))
 
     @property
+    def command_m(self) -> Float1D:
+        """The command of every sample."""
+        return self.block.channel("drive_disp_m")
+
+    @property
+    def mass_m(self) -> Float1D:
+        """The displacement of the mass at every sample."""
+        return self.block.channel("mass_disp_m")
+
+    @property
     def stop(self) -> RunStop:
         """The last record."""
         stop = self.items[-1]
@@ -84,9 +94,9 @@ class PlayedSession:
 
 def play_session(
     profile: Profile,
+    stop_s: float = math.inf,
     rig: RigConfig = RIG,
     operate: Callable[[], OperatorCommand | None] = lambda: None,
-    stop_s: float = math.inf,
     clock: ManualClock | None = None,
     backend: Backend | None = None,
 ) -> PlayedSession:

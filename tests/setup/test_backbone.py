@@ -10,9 +10,9 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from table_io.records import Event, OrbitPoint, RunStop
 from table_io.units import GRAVITY_M_S2
+from tests.builders.sessions import PlayedSession, play_session
 from tests.input_errors import raises_input_error
 from tests.model.reference import snm
-from tests.table_io.acquisition.test_orbit_session import RATE_HZ, Run, run
 from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming
@@ -24,6 +24,7 @@ from twin.setup.phase_resonance import (
 )
 from twin.setup.run_config import read_run_config
 
+RATE_HZ = 2000.0
 RANGE_HZ = (1.3, 4.5)
 TIMING = FeedbackTiming(latency_s=0.045, jitter_s=0.005, block_s=0.01)
 # By shooting on the simulated plant itself, payload reaction included: g, f in Hz, |U_1| in mm.
@@ -92,7 +93,7 @@ def test_levels_of_the_plan_rise_and_a_latency_that_is_too_large_leaves_no_gain(
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, Run]:
+def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, PlayedSession]:
     """Three levels of the shipped backbone, from 0.012 to 0.02 g, on the simulated rig."""
     path: Path = tmp_path_factory.mktemp("backbone") / "short.toml"
     text = (PROFILES_DIR / "tests" / "g4_backbone.toml").read_text(encoding="utf-8")
@@ -105,7 +106,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, Run]:
         text = text.replace(before, after)
     path.write_text(text, encoding="utf-8")
     profile = read_run_config(path).profile
-    return profile, run(profile)
+    return profile, play_session(profile)
 
 
 def test_backbone_is_that_of_the_plant(measured) -> None:

@@ -61,13 +61,11 @@ TARGETS = {
         ("table_io/safety/protection/*.py",),
         tuple(
             f"tests/table_io/safety/test_{name}.py"
-            for name in ("consistency", "sample_checks", "protection_laws", "protection")
+            for name in ("consistency", "sample_checks", "cycle_checks", "protection")
         ),
     ),
     "session": Target(
-        tuple(
-            f"table_io/acquisition/{name}.py" for name in ("session", "output_queue", "event_log")
-        ),
+        tuple(f"table_io/acquisition/{name}.py" for name in ("session", "output_queue")),
         tuple(
             f"tests/table_io/acquisition/test_{name}.py"
             for name in ("output_queue", "session_commands", "session")
@@ -77,12 +75,10 @@ TARGETS = {
         ("table_io/safety/preflight.py",), ("tests/table_io/safety/test_preflight.py",)
     ),
     "tracking": Target(
-        tuple(
-            f"table_io/control/{name}.py" for name in ("order_tracking", "amplitude_control", "frf")
-        ),
+        tuple(f"table_io/control/{name}.py" for name in ("order_tracking", "amplitude_control")),
         tuple(
             f"tests/table_io/control/test_{name}.py"
-            for name in ("order_tracking", "frf", "amplitude_control")
+            for name in ("order_tracking", "amplitude_control")
         ),
     ),
     "calibration": Target(

@@ -39,8 +39,11 @@ def test_each_fault_is_on_lines_of_its_own_below_its_place() -> None:
     inner = InputError("", where="a.toml", faults=[InputError("missing", key="k")])
     error = InputError("not started", where="all.toml", faults=[inner, InputError("late")])
     assert str(error).splitlines() == [
-        "all.toml: not started:", "  a.toml:", "    k: missing", "  late",
-    ]  # fmt: skip
+        "all.toml: not started:",
+        "  a.toml:",
+        "    k: missing",
+        "  late",
+    ]
     assert [fault.where for fault in error.faults] == ["a.toml", ""]
 
 

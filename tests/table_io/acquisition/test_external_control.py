@@ -20,13 +20,18 @@ from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.records import Check, Event, FrequencyResponse, RunStart, RunStop, Trip
 from tests.builders.drives import sine_segments
+from tests.builders.sessions import make_start
 from tests.table_io.acquisition.external_controller import Bystander, whole
 
 DRIVE_START_SAMPLE = 4000.37
 SWEEP = {
-    "start_hz": 2.4, "stop_hz": 2.8, "step_hz": 0.2, "cycles": 3, "measured_cycles": 2,
+    "start_hz": 2.4,
+    "stop_hz": 2.8,
+    "step_hz": 0.2,
+    "cycles": 3,
+    "measured_cycles": 2,
     "directions": ["forward"],
-}  # fmt: skip
+}
 
 
 def setup(check: bool = False, text: str = "", **changes: object) -> SessionSetup:
@@ -35,12 +40,6 @@ def setup(check: bool = False, text: str = "", **changes: object) -> SessionSetu
     path = find_config("follow_simulated", "rigs")
     rig = parse_toml(text or path.read_text(), RigConfig, "card")
     return SessionSetup(Profile.model_validate(raw), rig)
-
-
-def start(tare: dict[str, float], epoch_s: float) -> RunStart:
-    return RunStart(
-        0, "r", "n", "table", "", "", "", 2000.0, 20, (), (), 0, tare, {}, "", "", epoch_s
-    )
 
 
 @dataclass(frozen=True)
@@ -80,7 +79,7 @@ def run(
         session.rig, session.profile.specimen, 2000.0, clock, played, DRIVE_START_SAMPLE, ppm
     )
     asked = iter(range(10**9))
-    items = list(record_external(session, source, clock, start, lambda: orders(next(asked))))
+    items = list(record_external(session, source, clock, make_start, lambda: orders(next(asked))))
     return Followed(items, drive)
 
 

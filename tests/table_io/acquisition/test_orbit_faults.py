@@ -11,13 +11,13 @@ from table_io.acquisition.session import SessionSetup, run_session
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
-from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from table_io.records import Event, RunStart, RunStop, Trip
+from table_io.records import Event, RunStop, Trip
 from table_io.safety import loop_check
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.builders.rigs import RIG_TEXT
-from tests.table_io.acquisition.test_orbit_session import RATE_HZ, RIG, Run, make_profile, run
+from tests.builders.rigs import RIG, make_faulty_rig
+from tests.builders.sessions import PlayedSession, make_start, play_session
+from tests.table_io.acquisition.test_orbit_session import RATE_HZ, make_profile
 
 CAPTURE_S, HELD_S = 10.5, 25.0  # of the first orbit; its feedback is large, then small
 MAX_REST_S = 2.0  # from a fault to rest
@@ -30,12 +30,8 @@ TIMES = pytest.mark.parametrize(
 )
 
 
-def make_rig(kind: str, at_s: float, **keys: float | str) -> RigConfig:
-    """Return the simulated rig with a fault."""
-    lines = [f"at_s = {at_s}", *(f"{name} = {value!r}" for name, value in keys.items())]
-    text = RIG_TEXT
-    fault = "\n".join([*lines, f'kind = "{kind}"']).replace("'", '"')
-    return parse_toml(f"{text}\n[[simulated.faults]]\n{fault}\n", RigConfig, "rig")
+def plant_fault(kind: str, at_s: float, **keys: float | str) -> RigConfig:
+    return make_faulty_rig([{"kind": kind, "at_s": at_s, **keys}])
 
 
 def assert_rests_smoothly(command_m: Float1D, fault_s: float) -> None:
@@ -50,7 +46,7 @@ def assert_rests_smoothly(command_m: Float1D, fault_s: float) -> None:
     assert np.abs(acceleration[first - 100 :]).max() < MAX_ACCELERATION * LEVEL_M_S2
 
 
-def assert_recorded(result: Run) -> None:
+def assert_recorded(result: PlayedSession) -> None:
     """Every sample up to the end was delivered."""
     assert result.select(RunStop)[0].index == result.command_m.size
 
@@ -67,7 +63,9 @@ def assert_recorded(result: Run) -> None:
 )
 def test_protection_stops_a_held_orbit(kind: str, channel: str, trip: str, fault_s: float) -> None:
     """Among others where the feedback's own sensor fails, before the feedback can do harm."""
-    result = run(make_profile(), fault_s + 20.0, make_rig(kind, fault_s, channel=channel))
+    result = play_session(
+        make_profile(), fault_s + 20.0, plant_fault(kind, fault_s, channel=channel)
+    )
     assert [(t.kind, t.channel) for t in result.select(Trip)] == [(trip, channel)]
     assert result.select(RunStop)[0].verdict == "aborted"
     assert_rests_smoothly(result.command_m, fault_s)
@@ -83,7 +81,7 @@ def test_rig_that_stalls_runs_out_of_queue_and_rests(fault_s: float) -> None:
         if clock.now() > fault_s:
             clock.wait_until(clock.now() + next(stalls, 0.0))
 
-    result = run(make_profile(), fault_s + 20.0, operate=stall, clock=clock)
+    result = play_session(make_profile(), fault_s + 20.0, operate=stall, clock=clock)
     assert [trip.kind for trip in result.select(Trip)] == ["late"]
     assert result.select(RunStop)[0].verdict == "aborted"
     assert_rests_smoothly(result.command_m, fault_s)
@@ -94,18 +92,20 @@ def test_rig_that_stalls_runs_out_of_queue_and_rests(fault_s: float) -> None:
 @TIMES
 def test_samples_that_come_late_do_not_lose_the_orbit(fault_s: float) -> None:
     """The feedback answers later; during the capture it fades for a while."""
-    result = run(make_profile(slice(1)), fault_s + 8.0, make_rig("late", fault_s, size=0.15))
+    result = play_session(
+        make_profile(slice(1)), fault_s + 8.0, plant_fault("late", fault_s, size=0.15)
+    )
     assert any(event.kind == "late" for event in result.select(Event))
     assert not any(event.kind == "lost" for event in result.select(Event))
     assert result.select(RunStop)[0].verdict == "stopped"
     assert_rests_smoothly(result.command_m, fault_s + 8.1)
     steady = slice(round((fault_s + 4.0) * RATE_HZ), round((fault_s + 7.0) * RATE_HZ))
-    undisturbed = run(make_profile(slice(1)), fault_s + 8.0).mass_m
+    undisturbed = play_session(make_profile(slice(1)), fault_s + 8.0).mass_m
     assert np.ptp(result.mass_m[steady]) == pytest.approx(np.ptp(undisturbed[steady]), rel=0.05)
 
 
 def test_silent_machine_halts_the_test() -> None:
-    result = run(make_profile(), HELD_S + 20.0, make_rig("stall", HELD_S))
+    result = play_session(make_profile(), HELD_S + 20.0, plant_fault("stall", HELD_S))
     (stop,) = result.select(RunStop)
     assert stop.verdict == "halted"
     assert_recorded(result)
@@ -119,13 +119,7 @@ def test_queue_of_a_dead_rig_ends_at_rest() -> None:
     backend = open_backend(RIG, profile, clock)
     assert isinstance(backend, SimulatedBackend)
 
-    def describe(tare: dict[str, float], epoch_s: float) -> RunStart:
-        return RunStart(
-            0, "r", "n", "table", "", "", "", RATE_HZ, 20, RIG.channels, profile.steps, 0, tare,
-            {}, "", "", epoch_s,
-        )  # fmt: skip
-
-    session = run_session(SessionSetup(profile, RIG), backend, clock, describe, lambda: None)
+    session = run_session(SessionSetup(profile, RIG), backend, clock, make_start, lambda: None)
     blocks = (item for item in session if isinstance(item, Block))
     played: list[Float1D] = []
     checked = 0
@@ -152,6 +146,6 @@ def test_slow_decision_is_made_once_and_the_feedback_answers_after_it(
         return evaluate(*arguments)
 
     monkeypatch.setattr(loop_check, "evaluate", evaluate_slowly)
-    result = run(make_profile(slice(1)), CAPTURE_S + 2.0, clock=clock)
+    result = play_session(make_profile(slice(1)), CAPTURE_S + 2.0, clock=clock)
     assert result.select(RunStop)[0].verdict == "stopped"
     assert np.abs(result.command_m[round(CAPTURE_S * RATE_HZ) :]).max() > 1e-3

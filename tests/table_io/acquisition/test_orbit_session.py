@@ -2,8 +2,8 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,18 +11,17 @@ import numpy as np
 import pytest
 
 from table_io.acquisition.external_control import plan_open_loop_drive
-from table_io.acquisition.session import OperatorCommand, SessionSetup, run_session
-from table_io.backends import open_backend
+from table_io.acquisition.session import OperatorCommand
 from table_io.block import Block
-from table_io.clock import ManualClock
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.orbit_feedback import advance_feedback
 from table_io.errors import InputError
-from table_io.records import Event, OrbitPoint, Record, RunStart, RunStop
+from table_io.records import Event, OrbitPoint, RunStop
 from table_io.sequencer import orbits, procedure, releases
 from table_io.sim.plant import Plant
 from tests.builders.rigs import RIG
+from tests.builders.sessions import PlayedSession, play_session
 from tests.table_io.sim.plant_orbits import trace_orbits
 
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
@@ -63,55 +62,12 @@ def make_profile(
     )
 
 
-@dataclass
-class Run:
-    """Everything that a session yielded."""
-
-    command_m: np.ndarray = field(default_factory=lambda: np.empty(0))
-    mass_m: np.ndarray = field(default_factory=lambda: np.empty(0))
-    records: list[Record] = field(default_factory=list)
-
-    def select(self, kind: type) -> list[Any]:
-        return [record for record in self.records if isinstance(record, kind)]
-
-
-def run(
-    profile: Profile,
-    stop_s: float = math.inf,
-    rig: RigConfig = RIG,
-    operate: Callable[[], OperatorCommand | None] = lambda: None,
-    clock: ManualClock | None = None,
-) -> Run:
-    clock = clock or ManualClock()
-    position, parts, masses, result = [0], [], [], Run()
-
-    def describe(tare: dict[str, float], epoch_s: float) -> RunStart:
-        return RunStart(
-            0, "r", "n", "table", "", "", "", RATE_HZ, 20, rig.channels, profile.steps, 0, tare,
-            {}, "", "", epoch_s,
-        )  # fmt: skip
-
-    def command() -> OperatorCommand | None:
-        return OperatorCommand("stop", "time") if position[0] > stop_s * RATE_HZ else operate()
-
-    backend = open_backend(rig, profile, clock)
-    for item in run_session(SessionSetup(profile, rig), backend, clock, describe, command):
-        if isinstance(item, Block):
-            position[0] = item.end
-            parts.append(item.channel("drive_disp_m"))
-            masses.append(item.channel("mass_disp_m"))
-        elif not isinstance(item, RunStart):
-            result.records.append(item)
-    result.command_m, result.mass_m = np.concatenate(parts), np.concatenate(masses)
-    return result
-
-
 @pytest.fixture(scope="module")
-def held() -> Run:
-    return run(make_profile())
+def held() -> PlayedSession:
+    return play_session(make_profile())
 
 
-def test_unstable_orbits_are_held_without_feedback_left(held: Run) -> None:
+def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> None:
     points = held.select(OrbitPoint)
     assert [(point.step, point.accepted, point.reason) for point in points] == [
         (0, True, ""),
@@ -125,7 +81,7 @@ def test_unstable_orbits_are_held_without_feedback_left(held: Run) -> None:
     assert held.select(RunStop)[0].verdict == "complete"
 
 
-def test_latency_of_the_feedback_is_stated(held: Run) -> None:
+def test_latency_of_the_feedback_is_stated(held: PlayedSession) -> None:
     (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
     measured_ms = float(event.text.split()[3])
     assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
@@ -144,21 +100,21 @@ def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
     assert true == pytest.approx(TRUE_ORBITS[:, 2], rel=2e-3)
 
 
-def test_measured_orbits_are_those_of_the_plant(held: Run) -> None:
+def test_measured_orbits_are_those_of_the_plant(held: PlayedSession) -> None:
     for point in held.select(OrbitPoint):
         true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
         assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=0.004)
         assert point.amplitude_m > math.hypot(*point.u_m[2:4])
 
 
-def test_measured_multipliers_are_those_of_the_plant(held: Run) -> None:
+def test_measured_multipliers_are_those_of_the_plant(held: PlayedSession) -> None:
     for point in held.select(OrbitPoint):
         true = np.interp(point.frequency_hz, *TRUE_ORBITS[:, ::2].T)
         assert point.multiplier_sd < 0.15 * true
         assert abs(point.multiplier - true) < 3.0 * point.multiplier_sd
 
 
-def test_command_is_smooth_and_ends_at_rest(held: Run) -> None:
+def test_command_is_smooth_and_ends_at_rest(held: PlayedSession) -> None:
     acceleration = np.diff(held.command_m, 2) * RATE_HZ**2
     # The converter of the simulated table has steps of 0.46 um: 2 m/s2 in a second difference. The
     # capture may add the level of the test once more.
@@ -167,8 +123,8 @@ def test_command_is_smooth_and_ends_at_rest(held: Run) -> None:
     assert np.abs(held.command_m[-200:]).max() < 1e-6
 
 
-def test_run_is_reproduced_to_the_bit(held: Run) -> None:
-    again = run(make_profile(), stop_s=25.0)
+def test_run_is_reproduced_to_the_bit(held: PlayedSession) -> None:
+    again = play_session(make_profile(), stop_s=25.0)
     count = round(25.0 * RATE_HZ)
     assert again.command_m[:count].tobytes() == held.command_m[:count].tobytes()
 
@@ -184,7 +140,7 @@ def test_lost_orbit_is_left_for_rest_and_found_again(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(orbits, "advance_feedback", push)
     profile = make_profile(slice(1), max_feedback=0.3, multiplier_periods=0)
-    lost = run(profile, stop_s=80.0)
+    lost = play_session(profile, stop_s=80.0)
     (event,) = [event for event in lost.select(Event) if event.kind == "lost"]
     assert_left_for_rest(lost, event)
     (point,) = lost.select(OrbitPoint)
@@ -193,7 +149,7 @@ def test_lost_orbit_is_left_for_rest_and_found_again(monkeypatch: pytest.MonkeyP
     assert point.multiplier_sd is None
 
 
-def assert_left_for_rest(lost: Run, event: Event) -> None:
+def assert_left_for_rest(lost: PlayedSession, event: Event) -> None:
     """The command was at rest for a while within 2 s of the event."""
     after = lost.command_m[event.index : event.index + round(3.0 * RATE_HZ)]
     moving = np.flatnonzero(np.abs(after) > 1e-6)
@@ -209,7 +165,7 @@ def test_orbit_lost_in_a_release_is_recorded_and_the_next_one_found_from_rest(
     """The departure is let grow for so long that the feedback cannot catch it."""
     monkeypatch.setattr(orbits, "find_departure_limit", lambda *_: math.inf)
     monkeypatch.setattr(releases, "MAX_FREE_PERIODS", 12.0)
-    lost = run(make_profile(multiplier_periods=16), stop_s=100.0)
+    lost = play_session(make_profile(multiplier_periods=16), stop_s=100.0)
     events = [event for event in lost.select(Event) if event.kind == "lost"]
     assert [event.text.partition("; ")[2] for event in events] == [
         "the next one is approached from rest",
@@ -240,22 +196,22 @@ def test_operator_hold_in_a_release_lets_the_feedback_act_again(
         return OperatorCommand("hold", "") if len(released) == 50 else None
 
     monkeypatch.setattr(orbits, "advance_releases", spy)
-    result = run(make_profile(slice(1)), stop_s=66.0, operate=hold)
+    result = play_session(make_profile(slice(1)), stop_s=66.0, operate=hold)
     assert len(released) == 50
     before = result.mass_m[released[0] - 4000 : released[0]]
     after = result.mass_m[released[-1] + 4000 : released[-1] + 10_000]
     assert np.ptp(after) == pytest.approx(np.ptp(before), rel=0.03)
 
 
-def test_operator_stops_a_held_orbit(held: Run) -> None:
-    stopped = run(make_profile(), stop_s=24.0)
+def test_operator_stops_a_held_orbit(held: PlayedSession) -> None:
+    stopped = play_session(make_profile(), stop_s=24.0)
     assert stopped.select(RunStop)[0].verdict == "stopped"
     assert stopped.command_m.size < 27.0 * RATE_HZ
     assert np.abs(stopped.command_m[-200:]).max() < 1e-6
 
 
 def test_plan_for_a_shorter_latency_is_refused_before_the_orbits() -> None:
-    refused = run(make_profile(latency_s=0.031, table_lag_ms=1.0))
+    refused = play_session(make_profile(latency_s=0.031, table_lag_ms=1.0))
     assert refused.select(RunStop)[0].verdict == "aborted"
     assert not refused.select(OrbitPoint)
     assert np.abs(refused.command_m).max() < 2e-4  # the loop check only
@@ -294,7 +250,7 @@ def test_model_that_departs_too_far_ends_the_test_at_its_first_orbit() -> None:
     """The plan's orbit has twice the amplitude of the specimen's."""
     orbit = PLAN["points"][0]
     doubled = orbit | {"u_m": (2.0 * np.array(orbit["u_m"])).tolist()}
-    far = run(make_profile(planned=doubled, retries=0), stop_s=60.0)
+    far = play_session(make_profile(planned=doubled, retries=0), stop_s=60.0)
     stop = far.select(RunStop)[0]
     assert stop.verdict == "aborted"
     assert "no orbit can be held" in stop.reason

@@ -14,6 +14,7 @@ from table_io.config.calibration import command_to_si
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep
 from table_io.records import Event, FrequencyResponse
+from tests.builders.sessions import make_start
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
     RIG,
@@ -25,7 +26,6 @@ from tests.table_io.acquisition.test_session import (
     blocks,
     machine,
     profile,
-    start_record,
     stop_record,
 )
 
@@ -72,8 +72,9 @@ def test_drive_is_replaced_at_once_or_nothing_changes() -> None:
     np.testing.assert_allclose(
         subject.take_command(0, decaying.rest_start),
         decaying.command(0, decaying.rest_start),
-        rtol=0, atol=1e-15,
-    )  # fmt: skip
+        rtol=0,
+        atol=1e-15,
+    )
 
 
 def test_nothing_is_replaced_once_the_lead_has_run_out() -> None:
@@ -98,12 +99,14 @@ def test_tuned_test_plays_every_drive_that_was_decided_on() -> None:
     test = profile(stop_hz=2.5, directions=("forward",))
     defaults = type(test).model_fields
     test = test.model_copy(
-        update={name: defaults[name].get_default(call_default_factory=True)
-                for name in ("loop_check", "control")}
-    )  # fmt: skip
+        update={
+            name: defaults[name].get_default(call_default_factory=True)
+            for name in ("loop_check", "control")
+        }
+    )
     table = Watched(test)
     items: list[Any] = list(
-        run_session(SessionSetup(test, RIG), table, table.clock, start_record, Stop())
+        run_session(SessionSetup(test, RIG), table, table.clock, make_start, Stop())
     )
     whole = join_blocks(blocks(items))
     assert stop_record(items).verdict == "complete"
@@ -233,9 +236,10 @@ def test_decay_is_tried_five_times_then_that_behind_the_lead_plays(refusals: int
     queue = make_queue(device)
     queue.start()
     advance(queue, device, 3000)
-    whole, first, end, tries = (
-        queue.drive, queue.first_changeable(), queue._queued_end, device.tries,
-    )  # fmt: skip
+    whole = queue.drive
+    first = queue.first_changeable()
+    end = queue._queued_end
+    tries = device.tries
     device.refusals = refusals
     queue.decay()
     assert device.tries - tries == min(refusals + 1, 5)

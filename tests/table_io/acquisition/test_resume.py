@@ -11,7 +11,7 @@ from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_sweep
 from table_io.safety.preflight import compute_demands
-from table_io.sequencer.procedure import make_test_plan, nominal_drive, start_test
+from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from tests.builders.drives import sine_segment_at, sine_segments
 from tests.builders.rigs import RIG
 

@@ -21,6 +21,7 @@ from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
 from tests.builders.rigs import RIG
+from tests.builders.sessions import make_start
 
 RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
@@ -168,17 +169,10 @@ class Stop:
         return OperatorCommand("stop", "asked to stop") if stop else None
 
 
-def start_record(tare: dict[str, float], epoch_s: float) -> RunStart:
-    return RunStart(
-        0, "run", "short", "table", "", "", "", RATE_HZ, 20, RIG.channels, (), 0, tare, {}, "", "",
-        epoch_s,
-    )  # fmt: skip
-
-
 def session(
     machine: Any, commands: Callable[[], OperatorCommand | None], **changes: Any
 ) -> Iterator[Block | Record]:
-    return run_session(setup(**changes), machine, machine.clock, start_record, commands)
+    return run_session(setup(**changes), machine, machine.clock, make_start, commands)
 
 
 def machine(**options: Any) -> Machine:
@@ -266,7 +260,7 @@ def test_tare_is_subtracted_and_recorded() -> None:
 
 def test_lateness_is_counted_once_a_block() -> None:
     subject, punctual = machine(), LatenessLog()
-    source = run_session(setup(), subject, subject.clock, start_record, Stop(), punctual)
+    source = run_session(setup(), subject, subject.clock, make_start, Stop(), punctual)
     count = len(blocks(list(source)))
     assert punctual.late_s == [0.0] * count
 
@@ -408,11 +402,15 @@ def test_stop_that_comes_too_late_for_its_sample_is_given_again() -> None:
 @pytest.mark.parametrize("after", [2000, 6000, 9000])
 def test_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None:
     subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
-    items = list(session(subject, Stop()))
+    items = []
+    refused_after = 0
+    for item in session(subject, Stop()):
+        items.append(item)
+        if isinstance(item, Block) and subject.refused == 1:
+            refused_after = item.end
     stop = stop_record(items)
     assert stop.verdict == "aborted"
-    (trip,) = (item for item in items if isinstance(item, Trip))
-    assert trip.kind == "late"
+    assert stop.states[-2:] == ("stopping", "at rest")
     assert subject.command[-1] == 0.0
     assert subject.peak_acceleration() <= TAIL_PEAK
     whole = join_blocks(blocks(items))
@@ -423,8 +421,9 @@ def test_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None
         rtol=0,
         atol=ROUNDING_M,
     )
-    stopping = np.flatnonzero(whole.label == Label.STOP)
-    assert stopping.size
+    (trip,) = (item for item in items if isinstance(item, Trip))
+    decay_start = int(np.flatnonzero(whole.label == Label.STOP)[0])
+    assert trip == Trip(decay_start, refused_after, "late", "", 0.0, 0.0, stop.reason)
     assert stop.index >= subject.moved_until
 
 

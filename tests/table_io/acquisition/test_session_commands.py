@@ -14,7 +14,6 @@ from table_io.acquisition.output_queue import DECISION_S, OutputQueue
 from table_io.acquisition.session import (
     COMMAND_DELAY_S,
     MAX_LATENESS_S,
-    EventLog,
     OperatorCommand,
     SessionSetup,
     find_gaps,
@@ -29,6 +28,7 @@ from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip
 from table_io.sequencer import procedure
 from tests.builders.drives import sine_segments
+from tests.builders.sessions import make_start
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
     RIG,
@@ -39,7 +39,6 @@ from tests.table_io.acquisition.test_session import (
     machine,
     profile,
     session,
-    start_record,
     stop_record,
 )
 
@@ -48,9 +47,10 @@ REST_SAMPLES = round(profile().acquisition.rest_s * RATE_HZ)
 BLOCK_COUNT = plan_sweep(profile()).planned_end // BLOCK_SAMPLES
 FIRST_MOVING = sine_segments(plan_sweep(profile()))[0].start // BLOCK_SAMPLES + 1
 LAW = settings(
-    max_examples=12, derandomize=True,
+    max_examples=12,
+    derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
-)  # fmt: skip
+)
 VERDICTS = {"stop": "stopped", "abort": "aborted"}
 
 
@@ -182,10 +182,13 @@ def test_order_takes_effect_with_its_lead(after: int, wait: int, changes: Change
 
 @pytest.mark.parametrize(
     ("orders", "refused"),
-    [({1: "hold"}, ["hold in 'armed'"]), ({300: "resume"}, ["resume in 'running'"]),
-     ({300: "hold", 350: "hold", 400: "resume"}, ["hold in 'holding'"]),
-     ({300: "hold", 350: "resume", 351: "resume"}, ["resume in 'running'"])],
-)  # fmt: skip
+    [
+        ({1: "hold"}, ["hold in 'armed'"]),
+        ({300: "resume"}, ["resume in 'running'"]),
+        ({300: "hold", 350: "hold", 400: "resume"}, ["hold in 'holding'"]),
+        ({300: "hold", 350: "resume", 351: "resume"}, ["resume in 'running'"]),
+    ],
+)
 def test_order_out_of_place_is_refused_and_changes_nothing(
     orders: dict[int, str], refused: list[str], changes: Changes
 ) -> None:
@@ -334,7 +337,7 @@ def test_samples_from_999_thousandths_of_the_range_on_are_clipped(is_reversed: b
         for sensor in RIG.sensors
     )
     setup = SessionSetup(profile(), RIG.model_copy(update={"sensors": sensors}))
-    items = list(run_session(setup, subject, subject.clock, start_record, Stop(10)))
+    items = list(run_session(setup, subject, subject.clock, make_start, Stop(10)))
     gaps = [item for item in items if isinstance(item, SampleGap)]
     assert gaps == [
         SampleGap(at, 1, "force_l2_n", "clipped")
@@ -367,52 +370,6 @@ def test_gaps_are_the_runs_of_every_channel(density: float, seed: int) -> None:
     assert list(find_gaps(block, clipped)) == expected
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_first_late_block_of_each_series_is_an_event(seed: int) -> None:
-    draw = np.random.default_rng(seed)
-    lateness = draw.choice([0.0, 0.09, MAX_LATENESS_S, 0.101, 0.5], 60).tolist()
-    index = iter(range(1000, 2000))
-    log = EventLog(lambda: next(index))
-    late_ends = []
-    for end, late_s in enumerate(lateness):
-        log.report_lateness(late_s, end)
-        was_late = end > 0 and lateness[end - 1] > 0.1
-        late_ends += [end] if late_s > 0.1 and not was_late else []
-        if end % 7 == 0:
-            log.enter_state(f"state {end // 14}")
-    records = list(log.drain())
-    events_by_kind = {
-        kind: [event for event in records if isinstance(event, Event) and event.kind == kind]
-        for kind in ("late", "state")
-    }
-    assert [event.index for event in records if isinstance(event, Event)] == list(
-        range(1000, 1000 + len(records))
-    )
-    assert len(events_by_kind["late"]) == len(late_ends)
-    for event, end in zip(events_by_kind["late"], late_ends, strict=True):
-        assert {str(end), f"{lateness[end]:.3f}"} <= set(event.text.split())
-    states = [f"state {k}" for k in range(5)]
-    assert [event.text for event in events_by_kind["state"]] == states
-    assert log.states == ["idle", *states]
-    assert list(log.drain()) == []
-
-
-@pytest.mark.parametrize("after", [2000, 6000])
-def test_underrun_is_a_trip_at_the_first_sample_of_its_decay(after: int) -> None:
-    subject = Hasty(plan_sweep(profile()), ManualClock(), refused=1, after=after)
-    refused_after = 0
-    items = []
-    for item in session(subject, Stop()):
-        items.append(item)
-        if isinstance(item, Block) and subject.refused == 1:
-            refused_after = item.end
-    (trip,) = (item for item in items if isinstance(item, Trip))
-    whole = join_blocks(blocks(items))
-    decay_start = int(np.flatnonzero(whole.label == Label.STOP)[0])
-    assert trip == Trip(decay_start, refused_after, "late", "", 0.0, 0.0, stop_record(items).reason)
-    assert stop_record(items).states[-2:] == ("stopping", "at rest")
-
-
 def test_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -443,7 +400,7 @@ def test_overdue_calibrations_are_events_before_the_first_block(due: str) -> Non
     rig = RIG.model_copy(update={"sensors": dated})
     subject = machine()
     items = list(
-        run_session(SessionSetup(profile(), rig), subject, subject.clock, start_record, Stop(2))
+        run_session(SessionSetup(profile(), rig), subject, subject.clock, make_start, Stop(2))
     )
     warnings = find_overdue_calibrations(rig, local_datetime().date())
     assert len(warnings) == (len(RIG.sensors) - 1) * (due < "2026")

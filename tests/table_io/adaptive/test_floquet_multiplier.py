@@ -47,12 +47,14 @@ def test_without_noise_the_multiplier_is_exact(multiplier: float) -> None:
 
 def test_more_noise_is_less_certain() -> None:
     quiet, loud = (
-        np.mean([
-            estimate_multiplier(make_departures(3.1, seed, noise_m=noise_m)).sd
-            for seed in range(10)
-        ])
+        np.mean(
+            [
+                estimate_multiplier(make_departures(3.1, seed, noise_m=noise_m)).sd
+                for seed in range(10)
+            ]
+        )
         for noise_m in (NOISE_M, 3 * NOISE_M)
-    )  # fmt: skip
+    )
     assert loud > 2.0 * quiet
 
 

@@ -14,15 +14,30 @@ import numpy as np
 from table_io.backends import Backend
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock
+from table_io.config.base import parse_toml
 from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from tests.builders.drives import make_bump, make_rise
+from tests.builders.rigs import read_rig_text
 
 RATE_HZ = 2000.0
 MOTION_SAMPLES = 240  # samples of a motion; short, for some machines play it in real time
 LOST = range(700, 710)  # samples that a bench's machine loses, in all channels
 HANDOVER_SAMPLES = 200  # samples that a person at a slow computer needs to hand something over
 AWAY_S = 0.1  # a rig that is late, but not dead
+LOSS = f"""
+[[simulated.faults]]
+kind = "dropped"
+at_s = {LOST[0] / RATE_HZ}
+for_s = {len(LOST) / RATE_HZ}
+"""
+
+
+def read_lossy_rig(name: str) -> tuple[RigConfig, str]:
+    """Return a shipped rig whose machine loses LOST, and its text."""
+    text = read_rig_text(name) + LOSS
+    return parse_toml(text, RigConfig, name), text
 
 
 @dataclass(frozen=True)
@@ -110,18 +125,6 @@ def require_error(error: type[E], call: Callable[[], object], why: str) -> E:
     raise AssertionError(f"{why}: no {error.__name__}")
 
 
-def bump(volts: float, count: int = MOTION_SAMPLES) -> Float1D:
-    """A smooth motion away from 0 V and back, (count,), still at both ends."""
-    x = np.clip(np.arange(count) / (count - 2), 0.0, 1.0)
-    return volts * 64.0 * (x * (1.0 - x)) ** 3
-
-
-def rise(volts: float, count: int) -> Float1D:
-    """A smooth motion from 0 V to `volts`, (count,), still at both ends."""
-    x = np.clip(np.arange(count) / (count - 2), 0.0, 1.0)
-    return volts * x**3 * (10.0 + x * (-15.0 + 6.0 * x))
-
-
 @acquiring
 def it_says_what_it_is(bench: Bench) -> None:
     backend = bench.make(RATE_HZ)
@@ -178,7 +181,7 @@ def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
     ):
         quiet = 10 * sensor.noise_rms * sensor.si_per_unit + sensor.range_si * 1e-5
         assert np.ptp(line) <= 2 * quiet, f"{sensor.channel} moves"
-    command = bump(0.1)
+    command = make_bump(0.1, MOTION_SAMPLES)
     bench.begin(backend, command)
     bench.check_played(
         backend.read(MOTION_SAMPLES), command, "the run after a tare begins at sample 0"
@@ -190,7 +193,7 @@ def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
 def sample_0_leaves_when_sample_0_is_taken(bench: Bench) -> None:
     """Also where the first of the command is read alone, and every sample is another value."""
     backend = bench.open()
-    command = bump(1.0)
+    command = make_bump(1.0, MOTION_SAMPLES)
     backend.queue(0, command)
     before = bench.clock.now()
     backend.start()
@@ -227,10 +230,10 @@ def read_waits_for_its_last_sample(bench: Bench) -> None:
 def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
     lives = []
     for cuts in ((MOTION_SAMPLES,), (1, 7, 64, 0, MOTION_SAMPLES - 72)):
-        backend = bench.start_playing(bump(1.0))
+        backend = bench.start_playing(make_bump(1.0, MOTION_SAMPLES))
         lives.append(np.concatenate([backend.read(samples) for samples in cuts], axis=1))
         backend.close()
-        bench.check_played(lives[-1], bump(1.0), f"read in pieces of {cuts}")
+        bench.check_played(lives[-1], make_bump(1.0, MOTION_SAMPLES), f"read in pieces of {cuts}")
     if bench.repeatable:
         assert lives[0].tobytes() == lives[1].tobytes()
 
@@ -238,15 +241,15 @@ def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
 @clause
 def what_is_queued_later_is_replaced_exactly(bench: Bench) -> None:
     """Twice, the second time by less than what was queued: what lay behind is gone too."""
-    volts = np.concatenate([rise(1.0, 2 * HANDOVER_SAMPLES), np.full(400, 1.0)])
+    volts = np.concatenate([make_rise(1.0, 2 * HANDOVER_SAMPLES), np.full(400, 1.0)])
     backend = bench.start_playing(volts)
     read = [backend.read(20)]
     index = 20 + backend.replace_after + HANDOVER_SAMPLES
-    volts = np.concatenate([volts[:index], volts[index] + rise(-0.5, 300)])
+    volts = np.concatenate([volts[:index], volts[index] + make_rise(-0.5, 300)])
     backend.queue(index, volts[index:])
     read.append(backend.read(1))
     index += 20
-    volts = np.concatenate([volts[:index], volts[index] + rise(0.2, 40)])
+    volts = np.concatenate([volts[:index], volts[index] + make_rise(0.2, 40)])
     backend.queue(index, volts[index:])
     end = index + 340
     assert end < LOST[0]
@@ -273,7 +276,7 @@ def the_first_sample_that_may_be_replaced_is(bench: Bench) -> None:
 
 @clause
 def what_is_in_the_device_plays_as_it_was_queued(bench: Bench) -> None:
-    command = bump(1.0)
+    command = make_bump(1.0, MOTION_SAMPLES)
     backend = bench.start_playing(command)
     head = backend.read(100)
     for index in (-1, 0, 50, 99, 100, 99 + backend.replace_after - 1):
@@ -290,7 +293,7 @@ def what_is_in_the_device_plays_as_it_was_queued(bench: Bench) -> None:
 
 @clause
 def a_late_rig_cannot_rewrite_the_past(bench: Bench) -> None:
-    command = bump(1.0)
+    command = make_bump(1.0, MOTION_SAMPLES)
     backend = bench.start_playing(command)
     head = backend.read(1)
     bench.clock.wait_until(bench.clock.now() + AWAY_S)
@@ -308,7 +311,7 @@ def a_late_rig_cannot_rewrite_the_past(bench: Bench) -> None:
 
 @clause
 def what_is_no_voltage_is_refused(bench: Bench) -> None:
-    command = bump(1.0)
+    command = make_bump(1.0, MOTION_SAMPLES)
     backend = bench.open()
     require_error(ValueError, lambda: backend.queue(0, np.array([0.0, np.nan])), "NaN")
     backend.queue(0, command)
@@ -321,18 +324,20 @@ def what_is_no_voltage_is_refused(bench: Bench) -> None:
 @clause
 def the_last_value_is_held(bench: Bench) -> None:
     """At the end of the queue, and up to an index that lies beyond it."""
-    backend = bench.start_playing(rise(0.5, 100))
+    backend = bench.start_playing(make_rise(0.5, 100))
     beyond = 100 + backend.replace_after + HANDOVER_SAMPLES
-    down = 0.5 - rise(0.3, 100)
+    down = 0.5 - make_rise(0.3, 100)
     backend.queue(beyond, down)
-    expected = np.concatenate([rise(0.5, 100), np.full(beyond - 100, 0.5), down, np.full(50, 0.2)])
+    expected = np.concatenate(
+        [make_rise(0.5, 100), np.full(beyond - 100, 0.5), down, np.full(50, 0.2)]
+    )
     bench.check_played(backend.read(expected.size), expected, "held")
     backend.close()
 
 
 @acquiring
 def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
-    command = bump(1.0, 800)
+    command = make_bump(1.0, 800)
     backend = bench.start_playing(command)
     cuts = (LOST[0] - 10, 15, 40)
     volts = np.concatenate([backend.read(samples) for samples in cuts], axis=1)
@@ -350,7 +355,7 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
     idle = bench.open()
     idle.close()
     idle.close()
-    moving = bench.start_playing(bump(1.0))
+    moving = bench.start_playing(make_bump(1.0, MOTION_SAMPLES))
     moving.read(MOTION_SAMPLES // 2)
     moving.close()
     moving.close()
@@ -359,12 +364,12 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
 @acquiring
 def the_next_life_begins_at_rest_at_sample_0(bench: Bench) -> None:
     """Also where the life before was left in motion: open() waits until the machine rests."""
-    moving = bench.start_playing(bump(1.0))
+    moving = bench.start_playing(make_bump(1.0, MOTION_SAMPLES))
     moving.read(MOTION_SAMPLES // 2)
     moving.close()
     backend = bench.open()
     tare = compute_tare(backend.tare(400), bench.rig.sensors)
-    command = bump(0.5)
+    command = make_bump(0.5, MOTION_SAMPLES)
     bench.begin(backend, command)
     volts = backend.read(MOTION_SAMPLES)
     bench.check_played(volts, command, "the second life")

@@ -1,83 +1,144 @@
-"""Every backend keeps the contract; and each clause is seen to be broken where it is."""
+"""Every backend keeps the contract; and each clause fails where it is broken.
 
+A new backend is held to the clauses by one more entry of BENCHES.
+"""
+
+import inspect
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from table_io.backends.machine.client import MachineBackend
+from table_io.backends.ni.backend import NiBackend
 from table_io.block import Float1D, Float2D
 from table_io.clock import Clock, ManualClock, RealClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
+from table_io.sim.opendaq import DrivePlayback
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.profiles import SPECIMEN
-from tests.table_io.backends.conformance import CLAUSES, LOST, RATE_HZ, Bench
+from tests.table_io.acquisition.external_controller import Bystander
+from tests.table_io.backends.conformance import ACQUIRING, CLAUSES, RATE_HZ, Bench, read_lossy_rig
+from tests.table_io.backends.ni_wire import Bed
+from tests.table_io.backends.udp_bench import bench_of, c_target, python_target, relay_packets
 
-LOSS = f"""
-[[simulated.faults]]
-kind = "dropped"
-at_s = {LOST[0] / RATE_HZ}
-for_s = {len(LOST) / RATE_HZ}
-"""
-
-
-def card(name: str) -> tuple[RigConfig, str]:
-    """A shipped machine card whose machine loses LOST, and its text."""
-    text = (PROFILES_DIR / "rigs" / f"{name}.toml").read_text() + LOSS
-    return parse_toml(text, RigConfig, name), text
+OpenBench = Callable[[Path], AbstractContextManager[Bench]]
 
 
 def make_simulated_bench(clock: Clock, kind: type[SimulatedBackend] = SimulatedBackend) -> Bench:
-    rig, _ = card("simulated")
+    rig, _ = read_lossy_rig("simulated")
     return Bench(rig, clock, lambda rate: kind(rig, SPECIMEN, rate, clock), repeatable=True)
 
 
+def make_following_bench(clock: Clock, kind: type[Bystander] = Bystander) -> Bench:
+    """The Source of a session that follows: no queue, and somebody else plays."""
+    rig, _ = read_lossy_rig("follow_simulated")
+
+    def play(source: Bystander, volts: Float1D) -> None:
+        source.file = DrivePlayback(volts / rig.output.volts_per_m, RATE_HZ, RATE_HZ, 0.0)
+        source.start()
+
+    def make(rate: float) -> Bystander:
+        return kind(rig, SPECIMEN, rate, clock, np.zeros(2), begins=0.0)
+
+    return Bench(rig, clock, make, repeatable=True, play=play)
+
+
+def make_ni_bench() -> Bench:
+    """Client and device in one process, on one clock."""
+    bed = Bed(read_lossy_rig("ni_simulated")[1])
+    return Bench(bed.rig, bed.clock, bed.backend, repeatable=True)
+
+
 @contextmanager
-def machine(folder: Path) -> Iterator[Bench]:
-    """The simulated machine as a process of its own."""
-    text = card("machine")[1].replace("tcp/127.0.0.1:7450", f"unix/{folder / 'table'}")
+def serve(
+    name: str, shipped: str, address: str, folder: Path, pace: float = 1.0
+) -> Iterator[Bench]:
+    """A simulated machine as a process of its own."""
+    text = read_lossy_rig(name)[1].replace(shipped, address)
     path = folder / "card.toml"
     path.write_text(text)
-    rig, clock = parse_toml(text, RigConfig, str(path)), RealClock()
-    command: list[str | Path] = [Path(sys.executable).parent / "shaketwin", "table", "--rig", path]
+    rig, clock = parse_toml(text, RigConfig, str(path)), RealClock(pace)
+    kind = {"machine": MachineBackend, "ni_simulated": NiBackend}[name]
+    program = Path(sys.executable).parent / "shaketwin"
+    command = [str(program), "table", "--rig", str(path), "--time-scale", f"{pace:g}"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert "waiting at" in process.stdout.readline()
-        yield Bench(
-            rig, clock, lambda rate: MachineBackend(rig, SPECIMEN, rate, clock), repeatable=True
-        )
-        process.terminate()
+        try:
+            yield Bench(rig, clock, lambda rate: kind(rig, SPECIMEN, rate, clock), repeatable=True)
+        finally:
+            process.terminate()
 
 
-BENCHES: dict[str, Callable[[Path], AbstractContextManager[Bench]]] = {
+def serve_machine(folder: Path) -> AbstractContextManager[Bench]:
+    return serve("machine", "tcp/127.0.0.1:7450", f"unix/{folder / 'table'}", folder)
+
+
+def serve_ni(folder: Path) -> AbstractContextManager[Bench]:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    return serve("ni_simulated", "127.0.0.1:7470", address, folder, 2.0)
+
+
+def serve_udp(side: str, is_lossy: bool) -> OpenBench:
+    """A UDP target in Python or in C, also where packets are lost on the way."""
+
+    @contextmanager
+    def open_target(folder: Path) -> Iterator[Bench]:
+        with ExitStack() as stack:
+            target = {"python": python_target, "c": c_target}[side]
+            address = stack.enter_context(target(folder))
+            if is_lossy:
+                address = stack.enter_context(relay_packets(address, seed=1)).address
+            yield bench_of(address, RealClock(), repeatable=side == "python")
+
+    return open_target
+
+
+BENCHES: dict[str, OpenBench] = {
     "simulated, manual clock": lambda _: nullcontext(make_simulated_bench(ManualClock())),
     "simulated, real clock": lambda _: nullcontext(make_simulated_bench(RealClock(2.0))),
-    "machine process": machine,
+    "machine process": serve_machine,
+    "ni, one process": lambda _: nullcontext(make_ni_bench()),
+    "ni server": serve_ni,
+    "udp c, lossy": serve_udp("c", is_lossy=True),
+    "udp python, lossy": serve_udp("python", is_lossy=True),
+    "udp c": serve_udp("c", is_lossy=False),
+    "udp python": serve_udp("python", is_lossy=False),
+    "follow, manual clock": lambda _: nullcontext(make_following_bench(ManualClock())),
+    "follow, real clock": lambda _: nullcontext(make_following_bench(RealClock(2.0))),
 }
+# What holds where packets are lost holds where none are; that is tried less often.
+SLOW_BENCHES = {"udp python, lossy", "udp c", "udp python"}
 
 
-@pytest.fixture(scope="module", params=BENCHES)
+@pytest.fixture(scope="module")
 def bench(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Bench]:
-    """Every backend there is; a new one is one more parameter."""
-    if request.param == "machine process":
-        with machine(tmp_path_factory.mktemp("machine")) as machine_bench:
-            yield machine_bench
-    else:
-        yield make_simulated_bench(
-            ManualClock() if request.param == "manual clock" else RealClock()
-        )
+    with BENCHES[request.param](tmp_path_factory.mktemp("bench")) as opened:
+        yield opened
 
 
-@pytest.mark.parametrize("clause", CLAUSES)
-def test_every_backend_keeps_the_contract(clause: str, bench: Bench) -> None:
+@pytest.mark.parametrize(
+    ("bench", "clause"),
+    [
+        pytest.param(name, clause, marks=[pytest.mark.slow] if name in SLOW_BENCHES else [])
+        for name in BENCHES
+        for clause in (ACQUIRING if name.startswith("follow") else CLAUSES)
+    ],
+    indirect=["bench"],
+)
+def test_backend_keeps_the_contract(clause: str, bench: Bench) -> None:
     CLAUSES[clause](bench)
 
 
@@ -284,13 +345,20 @@ def test_every_clause_has_its_violation() -> None:
     assert BROKEN.keys() == CLAUSES.keys()
 
 
+def test_omitted_clauses_of_a_source_queue_a_command() -> None:
+    for name in CLAUSES.keys() - ACQUIRING.keys():
+        assert "backend.queue(" in inspect.getsource(CLAUSES[name])
+
+
 @pytest.mark.parametrize(
     ("clause", "kind"),
     [(clause, kind) for clause, kinds in BROKEN.items() for kind in kinds],
-    ids=lambda clause_or_kind: (
-        clause_or_kind if isinstance(clause_or_kind, str) else clause_or_kind.__name__
-    ),
+    ids=lambda value: value if isinstance(value, str) else value.__name__,
 )
 def test_clause_fails_for_a_broken_backend(clause: str, kind: type[SimulatedBackend]) -> None:
     with pytest.raises((AssertionError, OSError)):
         CLAUSES[clause](make_simulated_bench(ManualClock(), kind))
+    if clause in ACQUIRING and kind is not Anonymous:
+        source = type(kind.__name__, (kind, Bystander), {"__init__": Bystander.__init__})
+        with pytest.raises((AssertionError, OSError)):
+            ACQUIRING[clause](make_following_bench(ManualClock(), source))

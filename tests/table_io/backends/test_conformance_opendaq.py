@@ -21,9 +21,8 @@ from table_io.config.base import parse_toml
 from table_io.config.calibration import volts_to_si
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from tests.table_io.backends.conformance import ACQUIRING, Bench
+from tests.table_io.backends.conformance import ACQUIRING, Bench, read_lossy_rig
 from tests.table_io.backends.separate_processes import own_network
-from tests.table_io.backends.test_conformance import card
 
 pytest.importorskip("opendaq")
 FAR_SIDE = Path(__file__).with_name("opendaq_far_side.py")
@@ -40,7 +39,7 @@ class Device(Bench):
 @contextmanager
 def far_side(folder: Path, unit: str = "V") -> Iterator[Device]:
     """An openDAQ device in a process of its own, and a Bench on it."""
-    rig, text = card("follow_simulated")
+    rig, text = read_lossy_rig("follow_simulated")
     path = folder / "card.toml"
     path.write_text(text)
     clock = RealClock()

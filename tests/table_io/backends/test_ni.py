@@ -20,15 +20,15 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.records import RunStart, RunStop, SampleGap, Trip
+from table_io.records import RunStop, SampleGap, Trip
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
 from tests.builders.rigs import RIG_TEXT
+from tests.builders.sessions import make_start
 from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
 
-NOTHING = RunStart(0, "", "", "table", "", "", "", RATE_HZ, 20, (), (), 0, {}, {}, "", "", 0.0)
 SHORT = """
 title = "short"
 rig = "ni_simulated"
@@ -64,9 +64,7 @@ def start_backend(bed: Bed) -> NiBackend:
 def session(bed: Bed) -> list[Any]:
     profile = parse_toml(SHORT, Profile, "short")
     setup = SessionSetup(profile, bed.rig)
-    return list(
-        run_session(setup, bed.backend(), bed.clock, lambda tare, at: NOTHING, lambda: None)
-    )
+    return list(run_session(setup, bed.backend(), bed.clock, make_start, lambda: None))
 
 
 def test_session_is_played_without_a_gap() -> None:

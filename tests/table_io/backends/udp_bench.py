@@ -21,17 +21,11 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from tests.builders.profiles import SPECIMEN
 from tests.builders.rigs import read_rig_text
-from tests.table_io.backends.conformance import LOST, RATE_HZ, Bench
+from tests.table_io.backends.conformance import LOSS, LOST, Bench
 
 Address = tuple[str, int]
 TEXT = read_rig_text("udp_simulated")
 SHIPPED = "127.0.0.1:7460"
-LOSS = f"""
-[[simulated.faults]]
-kind = "dropped"
-at_s = {LOST[0] / RATE_HZ}
-for_s = {len(LOST) / RATE_HZ}
-"""
 SOURCES = Path(udp.__file__).parent
 FLAGS = ["-std=c99", "-O1", "-g", "-Wall", "-Wextra", "-Werror", "-Wconversion", "-pedantic"]
 EVILS = ("lost", "doubled", "reordered", "spoilt")

@@ -216,49 +216,14 @@ def test_text_without_its_file_is_refused() -> None:
     assert [fault.key for fault in refusal.value.faults] == ["excitation.file"]
 
 
-@pytest.mark.parametrize(
-    ("scale", "motion", "key", "allowed"),
-    [
-        (13.0, motion_mm, "displacement", "at most 60 mm"),
-        (1.0, lambda t: motion_mm(t) * np.sin(2 * np.pi * 8 * t), "acceleration", "at most 1 g"),
-        (
-            0.01,
-            lambda t: motion_mm(t) * np.sin(2 * np.pi * 25 * t),
-            "upper end of the excitation's band",
-            "at most 20",
-        ),
-        (9.0, lambda t: motion_mm(t) * np.sin(2 * np.pi * 3 * t), "velocity", "at most 500 mm/s"),
-        (4.0, lambda t: motion_mm(t) * np.sin(2 * np.pi * 8 * t), "force", "at most 30 kN"),
-    ],
-)
-def test_record_beyond_a_limit_of_the_rig_is_refused(
-    scale: float, motion: Callable[[Float1D], Float1D], key: str, allowed: str, tmp_path: Path
-) -> None:
-    profile, _ = load_profile(write(tmp_path, csv(motion=motion), f"scale = {scale}\n"))
+def test_band_beyond_that_of_the_rig_is_refused(tmp_path: Path) -> None:
+    text = csv(motion=lambda t: motion_mm(t) * np.sin(2 * np.pi * 25 * t))
+    profile, _ = load_profile(write(tmp_path, text, "scale = 0.01\n"))
     rows = compute_demands(plan_excitation(profile), profile, RIG)
     with pytest.raises(InputError) as refusal:
         check_limits(rows, profile, RIG, "test")
-    assert {fault.key: fault.allowed for fault in refusal.value.faults}[key] == allowed
-
-
-@pytest.mark.parametrize("scale", ["1e-5", "1e-170"])
-def test_record_too_small_for_the_output_is_refused(scale: str, tmp_path: Path) -> None:
-    """Of some tens of millimetres, so that a hundred-thousandth is below one step of 18 bits."""
-    profile, _ = load_profile(write(tmp_path, csv(), f"scale = {scale}\n"))
-    rows = compute_demands(plan_excitation(profile), profile, RIG)
-    with pytest.raises(InputError) as refusal:
-        check_limits(rows, profile, RIG, "test")
-    (fault,) = refusal.value.faults
-    assert (fault.key, fault.allowed) == ("displacement", "at least 20")
-
-
-def test_rate_that_the_rig_lacks_is_refused(tmp_path: Path) -> None:
-    profile, _ = load_profile(write(tmp_path, csv(), "[acquisition]\nrate_hz = 1500.0\n"))
-    with pytest.raises(InputError) as refusal:
-        check_limits(compute_demands(plan_excitation(profile), profile, RIG), profile, RIG, "test")
-    (fault,) = refusal.value.faults
-    assert (fault.key, fault.value) == ("acquisition.rate_hz", 1500.0)
-    assert fault.allowed == "1000, 2000, 4000"
+    allowed = {fault.key: fault.allowed for fault in refusal.value.faults}
+    assert allowed["upper end of the excitation's band"] == "at most 20"
 
 
 def test_drive_file_of_this_program_is_a_record() -> None:

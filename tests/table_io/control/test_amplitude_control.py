@@ -138,9 +138,12 @@ def simulate_overtones(
     return tuple(
         disturbance[order - 2]
         + tuning.transfer(order * target.frequency_hz)
-        * order**2 * target.level_m_s2 * target.correction * shape[order - 2]
+        * order**2
+        * target.level_m_s2
+        * target.correction
+        * shape[order - 2]
         for order in (2, 3, 4, 5)
-    )  # fmt: skip
+    )
 
 
 DISTURBANCE = (0.03 + 0.01j, -0.05j, 0.02 - 0.02j, 0.01 + 0j)

@@ -23,10 +23,15 @@ RATE_HZ = 1000.0
 AT_REST = Trajectory(RATE_HZ, 300, SineTarget(2.0, 0.0))
 SLOW, FAST = SineTarget(2.0, 0.5, 1.2, (0.01j,)), SineTarget(9.0, 0.4, 0.9)
 ENDS = [
-    (SineTarget(2.0, 0.0), SLOW), (SineTarget(2.0, 0.0), FAST), (SLOW, SineTarget(9.0, 0.0)),
-    (SLOW, FAST), (FAST, SLOW), (SLOW, replace(SLOW, correction=1.25)),
-    (SLOW, replace(SLOW, frequency_hz=2.1)), (SLOW, replace(SLOW, level_m_s2=5.0)),
-]  # fmt: skip
+    (SineTarget(2.0, 0.0), SLOW),
+    (SineTarget(2.0, 0.0), FAST),
+    (SLOW, SineTarget(9.0, 0.0)),
+    (SLOW, FAST),
+    (FAST, SLOW),
+    (SLOW, replace(SLOW, correction=1.25)),
+    (SLOW, replace(SLOW, frequency_hz=2.1)),
+    (SLOW, replace(SLOW, level_m_s2=5.0)),
+]
 
 
 def moving(target: SineTarget, phase: float = 0.0) -> Trajectory:
@@ -71,9 +76,10 @@ def test_blend_to_the_same_motion_is_none() -> None:
 def test_hold_keeps_its_target_and_advances_the_phase() -> None:
     held = moving(SLOW, 0.9).append_hold(430, 3, Label.MEASURE, 4, 1)
     assert held.segments == (
-        Segment(300, 430, Label.MEASURE, 3, 2.0, 2.0, 0.5, 0.5, 0.9, 4, 1, 1.2, 1.2, (0.01j,),
-                (0.01j,)),
-    )  # fmt: skip
+        Segment(
+            300, 430, Label.MEASURE, 3, 2.0, 2.0, 0.5, 0.5, 0.9, 4, 1, 1.2, 1.2, (0.01j,), (0.01j,)
+        ),
+    )
     assert (held.end, held.target) == (730, SLOW)
     assert held.phase == pytest.approx((0.9 + 0.86) % 1.0)
     again = held.append_hold(10, 3, Label.SETTLE)
@@ -91,8 +97,10 @@ def test_rest_and_histories_need_a_table_at_rest() -> None:
     assert segment.history_m is history_m
     assert len(played.append_history(history_m, 3).segments) == 2
     assert played.to_drive(()).segments == played.segments
-    for append in (lambda: moving(SLOW).append_rest(1), lambda: moving(SLOW).append_history(
-        history_m, 1)):  # fmt: skip
+    for append in (
+        lambda: moving(SLOW).append_rest(1),
+        lambda: moving(SLOW).append_history(history_m, 1),
+    ):
         with pytest.raises(ValueError, match="300"):
             append()
 
@@ -128,10 +136,12 @@ def test_cut_keeps_the_motion_before_it_and_ends_where_it_may() -> None:
 @pytest.mark.parametrize(
     "target",
     [
-        replace(SLOW, frequency_hz=2.2), replace(SLOW, level_m_s2=0.4),
-        replace(SLOW, correction=1.1), replace(SLOW, shape=(0.02j,)),
+        replace(SLOW, frequency_hz=2.2),
+        replace(SLOW, level_m_s2=0.4),
+        replace(SLOW, correction=1.1),
+        replace(SLOW, shape=(0.02j,)),
     ],
-)  # fmt: skip
+)
 def test_cut_keeps_a_blend(target: SineTarget) -> None:
     blended = moving(SLOW).append_blend(target, 0, 2.0, Label.BLEND)
     assert blended.cut(350) == blended

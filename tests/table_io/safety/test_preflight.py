@@ -239,8 +239,12 @@ def test_all_exceeded_limits_stand_in_one_refusal() -> None:
         fault.key: fault for fault in list_faults(demand_sweep(test), change_rig(limits=low), test)
     }
     assert faults.keys() == {
-        "displacement", "velocity", "acceleration", "force", "acquisition.rate_hz"
-    }  # fmt: skip
+        "displacement",
+        "velocity",
+        "acceleration",
+        "force",
+        "acquisition.rate_hz",
+    }
     rate = faults["acquisition.rate_hz"]
     assert (rate.value, rate.allowed) == (1500.0, "1000, 2000, 4000")
 

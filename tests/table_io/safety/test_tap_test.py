@@ -78,9 +78,11 @@ def test_tap_to_the_right_passes() -> None:
     lines = evaluate_lines(TABLE, swings)
     assert {line.verdict for line in lines.values()} == {"pass"}
     assert set(lines) == {
-        ("polarity", "table_acc_m_s2"), ("time after the first", "table_acc_m_s2"),
-        ("polarity", "table_disp_m"), ("time after the first", "table_disp_m"),
-    }  # fmt: skip
+        ("polarity", "table_acc_m_s2"),
+        ("time after the first", "table_acc_m_s2"),
+        ("polarity", "table_disp_m"),
+        ("time after the first", "table_disp_m"),
+    }
 
 
 @pytest.mark.parametrize("turned", ["table_acc_m_s2", "table_disp_m"])

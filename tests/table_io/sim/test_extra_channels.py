@@ -24,10 +24,16 @@ PROFILE = Profile.model_validate(
     {
         "title": "short",
         "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-        "sweep": {"start_hz": 2.4, "stop_hz": 2.4, "step_hz": 1.0, "cycles": 4,
-                  "measured_cycles": 2, "directions": ("forward",)},
+        "sweep": {
+            "start_hz": 2.4,
+            "stop_hz": 2.4,
+            "step_hz": 1.0,
+            "cycles": 4,
+            "measured_cycles": 2,
+            "directions": ("forward",),
+        },
     }
-)  # fmt: skip
+)
 
 
 def acquire_sine(rig: RigConfig, samples: int = 2000) -> Block:

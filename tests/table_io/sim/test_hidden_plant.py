@@ -222,11 +222,28 @@ def test_adaptive_method_of_order_eight_finds_the_same_motion(kind: EffectDefini
 
 def test_integrator_is_of_fourth_order_through_contacts_with_many_laws() -> None:
     laws = HiddenCoefficients(
-        k3=1e7, k5=3e10, ke=3e5, dead_width=1e-3, c2=2e3, c3=2e4, cu=3e6, k1=8e3, tau=0.05, k2=1e8,
-        kc=4e10, ch=5e5, kb=2e5, tau_b=0.05, pull=50.0, gap_rate=1e-4, tilt=0.5,
+        k3=1e7,
+        k5=3e10,
+        ke=3e5,
+        dead_width=1e-3,
+        c2=2e3,
+        c3=2e4,
+        cu=3e6,
+        k1=8e3,
+        tau=0.05,
+        k2=1e8,
+        kc=4e10,
+        ch=5e5,
+        kb=2e5,
+        tau_b=0.05,
+        pull=50.0,
+        gap_rate=1e-4,
+        tilt=0.5,
         stiffness_ratio=(1.1, 0.9),
-        m2=20.0, w2=30.0, z2=0.02,
-    )  # fmt: skip
+        m2=20.0,
+        w2=30.0,
+        z2=0.02,
+    )
     given = with_effect(PHYSICAL[0], {"k3": 1e7})
 
     def ends(parts: int) -> Float1D:
@@ -258,10 +275,14 @@ def test_pressed_in_nonlinear_bumpers_rest(gaps: tuple[float, float]) -> None:
 
 def test_base_of_a_truth_stands_in_place_of_the_cards() -> None:
     base: dict[str, Any] = {
-        "mass_kg": 500.0, "damper_stiffness_n_m": 30e3, "damper_damping_n_s_m": 1e3,
-        "bumper_stiffness_n_m": 4e5, "bumper_damping_n_s_m": 800.0, "gap_right_m": 1e-3,
+        "mass_kg": 500.0,
+        "damper_stiffness_n_m": 30e3,
+        "damper_damping_n_s_m": 1e3,
+        "bumper_stiffness_n_m": 4e5,
+        "bumper_damping_n_s_m": 800.0,
+        "gap_right_m": 1e-3,
         "gap_left_m": 3e-3,
-    }  # fmt: skip
+    }
     plant = hide_laws(RIG, GroundTruth.model_validate({"base": base}))
     np.testing.assert_allclose(
         run(plant, command(2000)), run(replace(RIG, **base), command(2000)), atol=1e-6

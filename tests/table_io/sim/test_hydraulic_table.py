@@ -77,9 +77,15 @@ def solve_independently(oil: HydraulicCoefficients, times: Float1D) -> Float2D:
         ]
 
     solution = solve_ivp(
-        derivatives, (0.0, times[-1]), np.zeros(9), "DOP853", times, rtol=1e-9, atol=1e-13,
+        derivatives,
+        (0.0, times[-1]),
+        np.zeros(9),
+        "DOP853",
+        times,
+        rtol=1e-9,
+        atol=1e-13,
         max_step=1e-4,
-    )  # fmt: skip
+    )
     acceleration = [derivatives(t, s)[1] for t, s in zip(times, solution.y.T, strict=True)]
     return np.array([solution.y[0], acceleration])
 

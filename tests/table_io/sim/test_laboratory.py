@@ -254,8 +254,17 @@ def test_share_stays_within_0_and_1() -> None:
 # Filters
 
 
-@pytest.mark.parametrize(("form", "order"), [("butterworth", 1), ("butterworth", 3),
-    ("butterworth", 8), ("bessel", 2), ("bessel", 5), ("bessel", 8)])  # fmt: skip
+@pytest.mark.parametrize(
+    ("form", "order"),
+    [
+        ("butterworth", 1),
+        ("butterworth", 3),
+        ("butterworth", 8),
+        ("bessel", 2),
+        ("bessel", 5),
+        ("bessel", 8),
+    ],
+)
 def test_anti_alias_filter_has_the_response_of_its_prototype(form: str, order: int) -> None:
     rate, corner = 50e3, 100.0  # so fast that lines between samples are no error
     entry = imperfection("anti_alias_filter", form=form, order=order, corner_hz=corner)
@@ -423,9 +432,15 @@ def test_time_base_makes_the_motion_faster_than_stated(tmp_path: Path) -> None:
 
 def test_hum_has_its_rms_and_harmonics() -> None:
     entry = imperfection(
-        "hum", rms_over_noise=2.0, frequency=50.02, harmonic_2=0.0, harmonic_3=0.5, harmonic_5=0.0,
-        phase=0.3, phase_3=-1.0,
-    )  # fmt: skip
+        "hum",
+        rms_over_noise=2.0,
+        frequency=50.02,
+        harmonic_2=0.0,
+        harmonic_3=0.5,
+        harmonic_5=0.0,
+        phase=0.3,
+        phase_3=-1.0,
+    )
     absolute = imperfection("hum", channel="mass_disp_m", rms=1e-3, rms_over_noise=1.0)
     out = disturbance(entry, absolute, count=100_000)
     np.testing.assert_allclose(
@@ -470,9 +485,14 @@ def test_pink_noise_wanders_as_much_at_the_start_as_later() -> None:
 
 def test_drift_is_a_line_and_an_exponential_and_a_gain() -> None:
     entry = imperfection(
-        "drift", offset_per_h=2.0, offset_share_per_h=0.01, warm_up=0.5, warm_up_share=0.001,
-        gain_per_h=0.05, warm_up_time=3.0,
-    )  # fmt: skip
+        "drift",
+        offset_per_h=2.0,
+        offset_share_per_h=0.01,
+        warm_up=0.5,
+        warm_up_share=0.001,
+        gain_per_h=0.05,
+        warm_up_time=3.0,
+    )
     count = 10_000
     t = np.arange(count) / RATE_HZ
     out = disturbance(entry, count=count)
@@ -528,9 +548,14 @@ def test_accelerometers_feel_the_vertical_motion() -> None:
     signals = np.zeros((6, t.size))
     signals[0], signals[1] = y, y_acc
     cross = imperfection(
-        "cross_axis", channel="mass_acc_m_s2", share=0.04, vertical_share=0.1, frequency=30.0,
-        damping_ratio=0.1, lever=0.5,
-    )  # fmt: skip
+        "cross_axis",
+        channel="mass_acc_m_s2",
+        share=0.04,
+        vertical_share=0.1,
+        frequency=30.0,
+        damping_ratio=0.1,
+        lever=0.5,
+    )
     r = frequency / 30.0
     resonance = 1 / (1 - r**2 + 2j * 0.1 * r)
     sine = slice(40_000, None)

@@ -33,18 +33,37 @@ def build_published_table() -> Plant:
     plant = build_rig()
     assert plant.oil is not None
     oil = plant.oil._replace(
-        area=area_m2, table_mass=SPECIMEN_KG, oil_stiffness=A2 / area_m2**2,
-        leakage=A3 * area_m2**2 / A2, supply=supply_pa, open_flow=open_flow,
-        rated_flow=open_flow / math.sqrt(supply_pa), valve=math.sqrt(B2),
-        valve_damping=B1 / (2.0 * math.sqrt(B2)), fc=0.0, fs=0.0, viscous=0.0,
-        gain=A1B0 / (A2 * B2), feedforward=0.0, pressure_gain=0.0, frame_mass=1e15,
-    )  # fmt: skip
+        area=area_m2,
+        table_mass=SPECIMEN_KG,
+        oil_stiffness=A2 / area_m2**2,
+        leakage=A3 * area_m2**2 / A2,
+        supply=supply_pa,
+        open_flow=open_flow,
+        rated_flow=open_flow / math.sqrt(supply_pa),
+        valve=math.sqrt(B2),
+        valve_damping=B1 / (2.0 * math.sqrt(B2)),
+        fc=0.0,
+        fs=0.0,
+        viscous=0.0,
+        gain=A1B0 / (A2 * B2),
+        feedforward=0.0,
+        pressure_gain=0.0,
+        frame_mass=1e15,
+    )
     # The frame of the specimen stands on the ground: the spring of a mass that does not move.
     return replace(
-        plant, oil=oil, rate_hz=RATE_HZ, mass_kg=1e15, damper_stiffness_n_m=SPECIMEN_N_M,
-        damper_damping_n_s_m=SPECIMEN_N_S_M, table_mass_kg=SPECIMEN_KG, servo_delay_s=0.0,
-        gap_left_m=math.inf, gap_right_m=math.inf, payload_reaction=True,
-    )  # fmt: skip
+        plant,
+        oil=oil,
+        rate_hz=RATE_HZ,
+        mass_kg=1e15,
+        damper_stiffness_n_m=SPECIMEN_N_M,
+        damper_damping_n_s_m=SPECIMEN_N_S_M,
+        table_mass_kg=SPECIMEN_KG,
+        servo_delay_s=0.0,
+        gap_left_m=math.inf,
+        gap_right_m=math.inf,
+        payload_reaction=True,
+    )
 
 
 def build_published_system() -> signal.TransferFunction:
