@@ -71,7 +71,7 @@ class Edge:
         return self.share > 1.0
 
     @property
-    def signed(self) -> float:
+    def signed_factor(self) -> float:
         return self.sign * self.share
 
 
@@ -141,7 +141,7 @@ def test_check_level_alarm_and_stop(
         )
         return [item for item in cycle_checks.check_level(cycle) if item.severity == severity]
 
-    ratio = 1.0 + edge.signed * alarm
+    ratio = 1.0 + edge.signed_factor * alarm
     alarms = suspect(ratio, "alarm")
     is_measured = label == Label.MEASURE
     limit = (1 + edge.sign * alarm) * level
@@ -150,7 +150,7 @@ def test_check_level_alarm_and_stop(
     )
     for item in alarms:
         assert item.required_checks == 1
-    ratio = 10.0 ** (edge.signed * abort_db / 20.0)
+    ratio = 10.0 ** (edge.signed_factor * abort_db / 20.0)
     stops = suspect(ratio, "stop")
     limit = 10.0 ** (edge.sign * abort_db / 20.0) * level
     require_suspicion(stops, edge.is_beyond, "level", "table_acc_m_s2", ratio * level, limit)
@@ -164,7 +164,7 @@ def test_check_level_alarm_and_stop(
 @MANY
 def test_check_command_gain_at_its_limit(edge: Edge, command_m: float) -> None:
     limit = 0.02 + LSB_M / command_m
-    gain = 1.0 + edge.signed * limit
+    gain = 1.0 + edge.signed_factor * limit
     cycle = make_cycle({"drive_disp_m": gain * command_m * WAVE}, command=command_m * WAVE)
     suspicions = list(cycle_checks.check_command_gain(cycle))
     require_suspicion(
@@ -181,7 +181,7 @@ def test_check_command_gain_at_its_limit(edge: Edge, command_m: float) -> None:
 @MANY
 def test_check_table_mean_at_its_limit(edge: Edge, amplitude_m: float, sigma: float) -> None:
     limit = 0.075e-3 + 0.02 * amplitude_m + sigma
-    mean = edge.signed * limit
+    mean = edge.signed_factor * limit
     cycle = make_cycle({"table_disp_m": amplitude_m * WAVE + mean}, sigma={"table_disp_m": sigma})
     suspicions = list(cycle_checks.check_table_mean(cycle))
     require_suspicion(suspicions, edge.is_beyond, "drift", "table_disp_m", mean, limit)
@@ -208,7 +208,7 @@ def test_check_mass_mean_at_its_limit(
     half_m: float,
 ) -> None:
     limit = 0.1e-3 + 0.35 * half_m + asymmetry_m
-    swing = SwingAverage(edge.signed * limit, half_m, 20)
+    swing = SwingAverage(edge.signed_factor * limit, half_m, 20)
     cycle = make_cycle({}, rig, specimen=gaps)
     suspicions = list(cycle_checks.check_mass_mean(cycle, swing))
     require_suspicion(suspicions, edge.is_beyond, "drift", rig.channels[3], swing.mean, limit)
@@ -289,12 +289,12 @@ def test_check_response_of_both_sensors(
         return list(cycle_checks.check_response(cycle, pair, reference))
 
     limit = 0.2 + deflection
-    gain = 1.0 + edge.signed * limit
+    gain = 1.0 + edge.signed_factor * limit
     bound = 1.0 + edge.sign * limit
     gains = suspect([gain, 1.0 + other * larger * limit])
     require_suspicion(gains, edge.is_beyond, "response", "table_acc_m_s2", gain, bound)
     limit_s = max(0.5 * lag_s, 0.003) + deflection / OMEGA
-    extra_s = edge.signed * limit_s, other * larger * limit_s
+    extra_s = edge.signed_factor * limit_s, other * larger * limit_s
     lags = suspect([cmath.exp(-1j * OMEGA * each) for each in extra_s])
     lag, bound = lag_s + extra_s[0], lag_s + edge.sign * limit_s
     require_suspicion(lags, edge.is_beyond, "response", "table_disp_m", lag, bound)
@@ -411,17 +411,17 @@ def test_check_sensor_pair_offset_is_a_drift(
     # Below an error of gain of the average, and where it spoils nothing else.
     max_offset = 1e-3 * range_g * GRAVITY_M_S2 + 6.0 * sigma
     limit = max_offset + 0.12 * average
-    offset = edge.signed * limit
+    offset = edge.signed_factor * limit
     motion = [-edge.sign * average, wave, wave]
     item = suspect(make_pair(motion, [motion[0] + offset, wave, wave], sigma=sigma))
     assert (item is not None) == is_drift(item, offset, limit) == edge.is_beyond
     # Where it spoils the motion, it explains the difference, or most of it.
-    offset, spoiled = edge.signed * max_offset, 0.5 * wave
+    offset, spoiled = edge.signed_factor * max_offset, 0.5 * wave
     constant = (1.0, spoiled / offset, 0.0)
     limit = 1e-3 * range_g * GRAVITY_M_S2
     weight = 1.0 + constant[1] ** 2
     limit += 6.0 * math.hypot(sigma, constant[1] * 1e-12) / weight
-    offset = edge.signed * limit
+    offset = edge.signed_factor * limit
     constant = (1.0, spoiled / offset, 0.0)
     item = suspect(make_pair([0.0, wave, wave], [offset, wave + spoiled, wave], constant))
     assert item is not None
@@ -493,7 +493,7 @@ def test_cells_without_contact_carry_nothing(
     u = direction * 0.01 * WAVE
     count = int((direction * u < 0).sum())
     limit = 5.0 + 6.0 * sigma / math.sqrt(count)
-    offset = edge.signed * limit
+    offset = edge.signed_factor * limit
     for first, second in (side, side[::-1]):
         channels = {"mass_disp_m": u, first: offset, second: other * offset}
         suspicions, shares = check_cell_pairs(make_cycle(channels, sigma={first: sigma}), {})
@@ -569,7 +569,7 @@ def test_check_cell_pairs_share_at_its_limits(
         (math.pi / 4, math.radians(25.0), {}),
         (angle, math.radians(3.0), {side[0]: ForceShare(angle, means, 7)}),
     ):
-        measured = expected + edge.signed * (max_change + 6.0 * sigma_angle)
+        measured = expected + edge.signed_factor * (max_change + 6.0 * sigma_angle)
         cycle = share_force(side, measured, force_n, means, sigma)
         suspicions, shares = check_cell_pairs(cycle, before)
         assert len(suspicions) == edge.is_beyond
@@ -618,7 +618,7 @@ def test_check_cell_pairs_drift_across_the_axis(
     for _ in range(50):  # the uncertainty grows with the force itself
         uncertainty = sigma_angle * math.hypot(along_n, across_n)
         across_n = 5.0 * math.sqrt(2.0) + 6.0 * math.hypot(uncertainty, 2.0 * sigma_mean)
-    limit, across_n = across_n, edge.signed * across_n
+    limit, across_n = across_n, edge.signed_factor * across_n
     means = (
         50.0 + along_n * math.cos(angle) - across_n * math.sin(angle),
         70.0 + along_n * math.sin(angle) + across_n * math.cos(angle),
@@ -776,7 +776,7 @@ def test_update_table_response_if_plausible(gain: float, lag_s: float, edge: Edg
         inside = complex(float(np.nextafter(bound, 1.0)))
         assert unknown.update_table_response(inside, 1.5).lag_s == 0.0
     known = replace(unknown, gain=1.0, lag_s=0.0 if edge.sign < 0 else 0.02)
-    assert (update(known, 1.0 + 0.1 * edge.signed, lag_s) is known) == edge.is_beyond
+    assert (update(known, 1.0 + 0.1 * edge.signed_factor, lag_s) is known) == edge.is_beyond
 
 
 def test_visited_response_of_the_first_sound_check() -> None:
