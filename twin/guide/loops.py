@@ -49,9 +49,9 @@ LoopPair = tuple[ForceLoop, ForceLoop]  # without and with the effect
 
 
 def find_loops(effect: Effect) -> LoopPair:
-    """Return the loops of an effect: those shipped, or computed for one of a plug-in."""
+    """Return the loops of an effect: those shipped, or computed for a new one."""
     shipped = _read_shipped_loops()
-    return shipped[effect.id] if effect in EFFECTS else compute_loops(effect)
+    return shipped[effect.id] if effect.id in shipped else compute_loops(effect)
 
 
 @cache
