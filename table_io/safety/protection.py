@@ -22,8 +22,10 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import maximum_filter1d
 
 from table_io.block import Block, Bool2D, Float1D, Float2D, Label
+from table_io.config.excitation import History, history_acceleration
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_transfer
@@ -241,6 +243,10 @@ def _join_spans(context: ProtectionContext, spans: list[SampleSpan]) -> DriveCyc
 
 
 MAX_FINDINGS = 256  # per call of `check_samples`
+MAX_RECORD_RATIO = 1.3  # of the table's acceleration over the envelope of its target
+# The envelope of a target is its largest acceleration within this time before and after, and no
+# less than this share of its peak: impacts and friction add to quiet parts.
+ENVELOPE_S, MIN_ENVELOPE_RATIO = 0.25, 0.5
 HISTORY_KEY = 0.5  # motion without cycles
 HELD_LABELS = (Label.SETTLE, Label.MEASURE, Label.CHECK)
 _LABEL_KEYS = np.array(
@@ -288,6 +294,11 @@ class ProtectionState:
     span_parts: tuple[tuple[Float2D, Float1D, Float1D], ...] = ()
     last_sample: tuple[float, int, int] = (0.0, 0, 0)  # level, label, key of the newest sample
     cycle_state: CycleCheckState = field(default_factory=CycleCheckState)
+    record_limit: Float1D = field(
+        default_factory=lambda: np.empty(0)
+    )  # m/s2, from its first sample
+    record_samples: int = 0  # of the record that are played
+    is_off_target: bool = False  # found once a run
 
 
 def start_protection(
@@ -311,9 +322,58 @@ def start_protection(
         make_sample_state(channel_count),
         0,
         history,
+        record_limit=_limit_record(profile),
     )
     _warm_up_kernel(state)
     return state
+
+
+def _limit_record(profile: Profile) -> Float1D:
+    """Return the largest acceleration of the table that a drive allows in m/s2, (sample,).
+
+    Empty without a drive: a history played open loop is off its target as the table is.
+    """
+    excitation, rate_hz = profile.excitation, profile.acquisition.rate_hz
+    if not isinstance(excitation, History) or excitation.drive is None:
+        return np.empty(0)
+    size = np.abs(history_acceleration(profile.plan.target_m, rate_hz))
+    envelope = maximum_filter1d(size, 2 * math.ceil(ENVELOPE_S * rate_hz) + 1)
+    return MAX_RECORD_RATIO * np.maximum(envelope, MIN_ENVELOPE_RATIO * size.max())
+
+
+def _check_record(
+    state: ProtectionState, values: Float2D, block: Block
+) -> tuple[ProtectionState, list[Finding]]:
+    """Compare the table's acceleration with the target of a drive while it is played.
+
+    `values` (channel, history + sample); of three samples the median counts, as in other limits.
+    """
+    played = np.flatnonzero(block.is_history)
+    first, state = (
+        state.record_samples,
+        replace(state, record_samples=state.record_samples + played.size),
+    )
+    count = min(played.size, state.record_limit.size - first)
+    if count <= 0 or state.is_off_target:
+        return state, []
+    row = state.thresholds.acceleration_row
+    newest = values[row, values.shape[1] - len(block) - 2 :]
+    medians = np.median(np.lib.stride_tricks.sliding_window_view(newest, 3), axis=1)
+    acceleration, limit = medians[played[:count]], state.record_limit[first : first + count]
+    beyond = np.flatnonzero(np.abs(acceleration) > limit)
+    if beyond.size == 0:
+        return state, []
+    worst = int(beyond[0])
+    value, allowed = float(acceleration[worst]), float(limit[worst])
+    excitation, index = state.context.profile.excitation, block.index + int(played[worst])
+    name = getattr(excitation, "file", state.context.profile.title)
+    ratio = MAX_RECORD_RATIO * abs(value) / allowed
+    text = (
+        f"{name}: the table is at {ratio:.2f} times the envelope of its target at sample {index}; "
+        f"allowed: {MAX_RECORD_RATIO:g}; compute the drive for this table and level"
+    )
+    finding = Finding(index, "record", block.channels[row], value, allowed, text, stop=True)
+    return replace(state, is_off_target=True), [finding]
 
 
 def _warm_up_kernel(state: ProtectionState) -> None:
@@ -382,6 +442,8 @@ def inspect_samples(
                 state, mark == HALF_CYCLE, block.index + offset
             )
             findings += cycle_findings
+    state, record_findings = _check_record(state, values, block)
+    findings += record_findings
     tail = slice(len(block), None)
     kept_history = values[:, tail].copy(), command[tail].copy(), phase[tail].copy()
     return replace(state, index=block.end, history=kept_history), tuple(findings)
