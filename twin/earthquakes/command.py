@@ -18,7 +18,7 @@ from twin.earthquakes.task import (
     TableDriveOptions,
     TableTwinOptions,
     identify_table,
-    prepare_drive,
+    prepare_drive_computation,
 )
 from twin.live.run_command import run_test
 from twin.results.recordings import open_recording
@@ -84,7 +84,7 @@ def compute_drive_command(
 ) -> int:
     """Write a profile with the drive for its target; with iterations, run it and correct it."""
     with show_status("computing the drive on the twin of the table") as show_part:
-        computation = prepare_drive(options, show_part)
+        computation = prepare_drive_computation(options, show_part)
         drive = computation.compute(options.after, show_part)
     for note in drive.notes:
         print_line(f"warning: {note}")

@@ -96,7 +96,7 @@ def compute_drive(options: TableDriveOptions, report: Report = lambda stage: Non
     InputError if the test plays no displacement history, the rig is not that of the twin, or the
     run `after` is that of another target.
     """
-    return prepare_drive(options, report).compute(options.after, report)
+    return prepare_drive_computation(options, report).compute(options.after, report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class DriveComputation:
         )
 
 
-def prepare_drive(
+def prepare_drive_computation(
     options: TableDriveOptions, report: Report = lambda stage: None
 ) -> DriveComputation:
     """Read the test and the twin of the table, and simulate the specimen on the target."""

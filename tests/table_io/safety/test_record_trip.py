@@ -45,12 +45,12 @@ def test_a_table_far_off_the_target_of_its_drive_trips(
     (tmp_path / "drive.csv").write_text(drive)
     path.write_text(RECORD)
     session = play_session(load_profile(path)[0])
-    found = session.select(Trip)
-    assert bool(found) is trips
+    trip_records = session.select(Trip)
+    assert bool(trip_records) is trips
     if trips:
-        assert found[0].kind == "record"
-        assert found[0].channel == "table_acc_m_s2"
-        assert abs(found[0].value) > found[0].limit
+        assert trip_records[0].kind == "record"
+        assert trip_records[0].channel == "table_acc_m_s2"
+        assert abs(trip_records[0].value) > trip_records[0].limit
         # Rest follows: the table is not cut off.
         assert np.abs(session.block.channel("drive_disp_m")[-100:]).max() < 1e-4
     assert (session.stop.verdict == "complete") is not trips
