@@ -179,6 +179,7 @@ def test_the_command_writes_the_drive_of_the_task(drive: DriveResult, tmp_path: 
     assert result.returncode == 0
     assert "the drive is for rig hydraulic" in result.stdout
     assert (tmp_path / "out" / "drive.csv").read_text() == drive.format_drive()
+    assert drive.expected_error is not None
     assert f"{100 * drive.expected_error:.2g} %" in result.stdout
 
 
