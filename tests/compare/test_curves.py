@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,9 +12,10 @@ from twin.compare.curves import (
     Hysteresis,
     PrcJump,
     Solutions,
-    describe_sudden_change,
+    compare_amplitudes,
     detect_all_hysteresis,
     detect_hysteresis,
+    find_sudden_change,
 )
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.model.stepped_sine import simulate_stepped_sine
@@ -349,24 +351,38 @@ def test_gm2_has_a_left_one_in_the_model() -> None:
 # The hint while a test runs
 
 
-def test_a_hint_names_a_leap_of_one_direction() -> None:
-    a, b = point("forward", 4.0, measured(0.2)), point("forward", 4.2, measured(0.03))
-    assert (
-        describe_sudden_change(a, b)
-        == "forward: eta_d falls from 0.200 to 0.030 between 4 and 4.2 Hz"
-    )
-    assert "rises" in (describe_sudden_change(b, a) or "")
+@pytest.mark.parametrize(
+    ("before", "after", "change"),
+    [
+        ((4.0, 0.2), (4.2, 0.03), -1),
+        ((4.2, 0.03), (4.0, 0.2), 1),
+        ((4.0, 0.2), (4.1, 0.15), 0),
+        ((4.0, 0.2), (4.2, 0.0), 0),
+        ((4.0, 0.2), (4.2, math.nan), 0),
+    ],
+)
+def test_a_sudden_change_is_a_ratio_that_no_smooth_branch_reaches(
+    before: tuple[float, float], after: tuple[float, float], change: int
+) -> None:
+    first, second = (point("forward", hz, measured(eta)) for hz, eta in (before, after))
+    assert find_sudden_change(first, second, "measured") == change
 
 
-def test_no_hint_without_a_leap_or_over_a_turn() -> None:
-    a, b = point("forward", 4.0, measured(0.2)), point("forward", 4.2, measured(0.03))
-    assert describe_sudden_change(None, a) is None
-    assert describe_sudden_change(a, point("forward", 4.1, measured(0.15))) is None
-    assert describe_sudden_change(a, point("backward", 4.2, measured(0.03))) is None
-    assert describe_sudden_change(a, point("forward", 4.2, None)) is None
-    assert describe_sudden_change(point("forward", 4.0, None), b) is None
-    assert describe_sudden_change(a, point("forward", 4.2, measured(0.0))) is None
-    assert describe_sudden_change(a, point("forward", 4.2, measured(math.nan))) is None
+def test_a_sudden_change_needs_two_points_of_one_direction() -> None:
+    a = point("forward", 4.0, measured(0.2))
+    assert find_sudden_change(None, a, "measured") == 0
+    assert find_sudden_change(a, point("backward", 4.2, measured(0.03)), "measured") == 0
+    assert find_sudden_change(a, point("forward", 4.2, None), "measured") == 0
+    assert find_sudden_change(point("forward", 4.0, None), a, "measured") == 0
+
+
+@pytest.mark.parametrize(("eta", "is_apart"), [(1.05, False), (1.3, True), (0.2, True)])
+def test_amplitudes_beyond_a_tenth_and_the_scatter_are_different_solutions(
+    eta: float, is_apart: bool
+) -> None:
+    one, other = replace(measured(1.0), spread=0.05), replace(measured(eta), spread=0.05)
+    assert (compare_amplitudes(one, other) > 1) == is_apart
+    assert compare_amplitudes(one, other, allowance=1.0) < 1
 
 
 def test_many_sweeps_at_once_are_judged_as_one_by_one() -> None:

@@ -330,7 +330,7 @@ def test_lost_load_cells_and_accelerometer_leave_the_displacement(
 def test_a_leap_is_an_event(setup: pipeline.PipelineSetup, measured: Block) -> None:
     events = of(run_pipeline(setup, [measured]), Event)
     assert {event.kind for event in events} == {"jump"}
-    assert "forward: the jump down between 3 and 4.6 Hz came" in events[0].text
+    assert "forward, 3 to 4.6 Hz: eta_d" in events[0].text
 
 
 # Steps that are decided on while the test runs

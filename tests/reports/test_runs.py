@@ -2,6 +2,7 @@
 
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,8 @@ from tests.input_errors import raises_input_error
 from tests.reports.folders import make
 from tests.reports.recordings import summary
 from twin.cli.run_path import parse_run_path
+from twin.report.compare_command import _load_run
+from twin.report.run_comparison import compare_summaries
 from twin.report.run_index import (
     find_last_run,
     find_run_folders,
@@ -156,6 +159,13 @@ def test_two_runs_are_compared(comparable: list[Path]) -> None:
     assert {row["name"] for row in comparison["model"]} >= {"stiffness", "gap_r"}
 
 
+def test_estimates_beside_two_models_have_no_standard_deviations(comparable: list[Path]) -> None:
+    runs = [_load_run(path) for path in comparable]
+    other = replace(runs[1], parameters={**runs[1].parameters, "coulomb_friction.fc": 50.0})
+    stiffness, _ = compare_summaries(runs[0], other)["estimates"]
+    assert (stiffness["change"], stiffness["sigma"], stiffness["changed"]) == (2e3, None, False)
+
+
 @pytest.mark.usefixtures("draft")
 def test_the_comparison_has_a_page_and_its_data(comparable: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "compared"
@@ -163,5 +173,8 @@ def test_the_comparison_has_a_page_and_its_data(comparable: list[Path], tmp_path
     page = (out / "compare.html").read_text()
     assert page.count("data:image/png;base64,") == 1
     assert "38.00 ± 0.20 kN/m" in page
-    assert json.loads((out / "comparison.json").read_text())["runs"][1]["misfit"] == 2.0
+    assert (
+        json.loads((out / "comparison.json").read_text())["runs"][1]["misfit"]
+        == "2 times the noise"
+    )
     assert call_main("compare", *comparable, "--out", out).returncode == 2, "nothing overwritten"

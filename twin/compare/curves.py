@@ -241,20 +241,30 @@ def _interval_jumps(
     return jumps
 
 
-def describe_sudden_change(before: PrcPoint | None, after: PrcPoint) -> str | None:
-    """Describe a jump of measured eta_d between neighbors of one direction; None without one.
+def compare_amplitudes(
+    first: NormalizedResponse, second: NormalizedResponse, allowance: float = 0.0
+) -> float:
+    """Return the difference of two eta_d over the largest that one steady motion explains.
+
+    Beyond 1 they are different solutions. The largest is a tenth of the larger one, plus the ranges
+    over the measured cycles, plus an `allowance` for noise and set-up, as eta_d. NaN if one is
+    unknown.
+    """
+    a, b = first.eta_d, second.eta_d
+    largest = MIN_BRANCH_DIFFERENCE * max(a, b) + a * first.spread + b * second.spread + allowance
+    return abs(a - b) / largest if largest > 0 else math.nan
+
+
+def find_sudden_change(before: PrcPoint | None, after: PrcPoint, source: str) -> int:
+    """Return 1 or -1 where eta_d of a source jumps up or down between neighbours; 0 without a jump.
 
     Only a hint during the test: `detect_hysteresis` decides on jumps, with both directions.
     """
-    if before is None or before.measured is None or after.measured is None:
-        return None
-    if before.direction != after.direction:
-        return None
-    a, b = before.measured.eta_d, after.measured.eta_d
-    if max(a, b) < MIN_JUMP_RATIO * min(a, b) or min(a, b) <= 0:
-        return None
-    verb = "rises" if b > a else "falls"
-    return (
-        f"{after.direction}: eta_d {verb} from {a:.3f} to {b:.3f} between "
-        f"{before.frequency_hz:g} and {after.frequency_hz:g} Hz"
-    )
+    values = None if before is None else getattr(before, source)
+    next_values = getattr(after, source)
+    if before is None or values is None or next_values is None:
+        return 0
+    low, high = sorted((values.eta_d, next_values.eta_d))
+    if before.direction != after.direction or not 0 < low <= high / MIN_JUMP_RATIO:
+        return 0
+    return 1 if next_values.eta_d > values.eta_d else -1

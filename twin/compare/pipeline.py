@@ -28,7 +28,7 @@ from twin.compare.cycles import (
 from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring import MonitoringState
 from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
-from twin.compare.monitoring.jumps import JumpPrediction, predict_jumps
+from twin.compare.monitoring.jumps import ExpectedJump, predict_jumps
 from twin.compare.monitoring.low_cut import LowCutRemoval
 from twin.compare.prediction_hash import HASHED_BLOCKS, hash_cells
 from twin.compare.sensors import remove_sensor_errors
@@ -54,7 +54,7 @@ class PipelineSetup:
     scale: PrcScale
     steps: tuple[Step, ...]
     measured_cycles: int
-    jump_prediction: JumpPrediction = field(default_factory=JumpPrediction)
+    expected_jumps: tuple[ExpectedJump, ...] = ()
     added_steps: tuple[Step, ...] = ()
 
     @property
@@ -123,8 +123,8 @@ def prepare_pipeline(
     scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
     if not steps or profile.continuation is not None:  # no numbered cycles, no curves
         return PipelineSetup(twin, scale, steps, measured_cycles=0)
-    jump_prediction = predict_jumps(profile, model, steps, u_star)
-    return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, jump_prediction)
+    expected_jumps = predict_jumps(profile, model, steps)
+    return PipelineSetup(twin, scale, steps, profile.sweep.measured_cycles, expected_jumps)
 
 
 def add_steps(setup: PipelineSetup, *decisions: StepAdded) -> PipelineSetup:
@@ -153,7 +153,7 @@ def start_pipeline(setup: PipelineSetup, index: int = 0) -> tuple[PipelineState,
     params = Params(index, setup.twin.model.flatten(), "start")
     return PipelineState(
         start_twins(setup.twin, index),
-        monitoring=monitoring.start_monitoring(setup.jump_prediction),
+        monitoring=monitoring.start_monitoring(setup.expected_jumps),
     ), [params]
 
 

@@ -38,6 +38,7 @@ from twin.laws.library import find_effect
 from twin.live.run_command import run_test
 from twin.results.report_data import extract_prc
 from twin.results.summary import parse_jumps, prc_points
+from twin.results.twin_verdict import format_misfit
 from twin.setup.folders import make_output_folder, make_run_folder
 from twin.system.files import open_in_browser
 from twin.system.terminal import print_line
@@ -79,11 +80,14 @@ class TwinError:
     noise_floor: float
     summary: dict[str, Any]
 
+    @property
+    def verdict(self) -> str:
+        """Verdict on the twin."""
+        return str(self.summary["twin_verdict"]["verdict"])
+
     def __str__(self) -> str:
-        return (
-            f"{100 * self.error:.2g} % of the motion, {self.error / self.noise_floor:.2g} times "
-            "the noise of the sensors"
-        )
+        misfit = format_misfit(self.summary["twin_verdict"])
+        return f"the twin {self.verdict}, {100 * self.error:.2g} % of the motion off, {misfit}"
 
 
 def run_demo(out: Path | None, seed: int | None, keep: Path | None, show_page: bool) -> int:

@@ -52,7 +52,8 @@ def _print_comparison(comparison: Json) -> None:
     for head in ("", "first", "second"):
         table.add_column(head)
     for label, key in (("folder", "folder"), ("date", "started_at"), ("test", "title"),
-                       ("model", "model"), ("test ended", "verdict"), ("twin", "twin_verdict"),
+                       ("model", "model"), ("test ended", "verdict"),
+                       ("excitation", "excitation_verdict"), ("twin", "twin_verdict"),
                        ("warnings", "warnings")):  # fmt: skip
         cells = ["-" if run[key] is None else str(run[key]) for run in comparison["runs"]]
         table.add_row(label, *cells)

@@ -6,12 +6,19 @@ from rich.markup import escape
 
 from twin.recording.reader import read_recording
 from twin.results import summary as summaries
+from twin.results.excitation_verdict import format_excitation_verdict
 from twin.results.rerun import restore_predictions
 from twin.results.twin_verdict import NOTHING_MEASURED, format_twin_verdict
 from twin.setup.run_config import RunConfig
 from twin.system.terminal import console, print_line
 
-VERDICT_COLOURS = {"agrees": "green", "departs": "red", "not judged": "yellow"}
+VERDICT_COLOURS = {
+    "agrees": "green",
+    "reached": "green",
+    "departs": "red",
+    "missed": "red",
+    "not judged": "yellow",
+}
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
@@ -39,12 +46,17 @@ def finalize_run(
 
 
 def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
-    """Print the verdict on the twin and the next command, coloured; nothing without a twin."""
-    verdict = summary["twin_verdict"]
+    """Print the verdicts on excitation and twin, coloured; nothing without a twin."""
+    excitation, verdict = summary["excitation_verdict"], summary["twin_verdict"]
     if verdict["reason"] == NOTHING_MEASURED:
         return
-    colour = VERDICT_COLOURS[verdict["verdict"]]
+    _print_coloured(format_excitation_verdict(excitation), excitation["verdict"])
     first, *lines = format_twin_verdict(verdict, folder)
-    console.print(f"[bold {colour}]{escape(first)}[/]", highlight=False, soft_wrap=True)
+    _print_coloured(first, verdict["verdict"])
     for line in lines:
         print_line(f"  {line}")
+
+
+def _print_coloured(line: str, verdict: str) -> None:
+    colour = VERDICT_COLOURS[verdict]
+    console.print(f"[bold {colour}]{escape(line)}[/]", highlight=False, soft_wrap=True)

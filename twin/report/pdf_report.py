@@ -12,6 +12,7 @@ from table_io.records import format_kind
 from twin.drawing.plot_style import FIGURE_WIDTH_IN, RC_PARAMS
 from twin.report.figures import draw_figures
 from twin.report.report import format_headline
+from twin.results.excitation_verdict import format_excitation_verdict
 from twin.results.report_data import ReportData, step_quantity
 from twin.results.twin_verdict import NOTHING_MEASURED, format_twin_verdict
 
@@ -43,6 +44,8 @@ def _describe_run(run: ReportData) -> list[str]:
     ]  # fmt: skip
     verdict = summary.get("twin_verdict")
     if verdict and verdict["reason"] != NOTHING_MEASURED:
+        if excitation := summary.get("excitation_verdict"):
+            lines.append(format_excitation_verdict(excitation))
         lines += [*format_twin_verdict(verdict, run.recording.path.parent), ""]
     lines += [f"Run      {start.run}", f"Started  {start.started_at} on {start.host}"]
     lines.append(f"Gap      {_format_gap(run)}")

@@ -38,7 +38,13 @@ from twin.results.report_data import (
 from twin.results.sensor_table import build_sensor_rows
 from twin.results.summary import load_summary, parse_toml_tables
 from twin.results.table_motion import format_required, format_tracking
-from twin.results.twin_verdict import NOTHING_MEASURED, describe_worst, format_jump, name_command
+from twin.results.twin_verdict import (
+    NOTHING_MEASURED,
+    describe_worst,
+    format_jump,
+    format_misfit,
+    name_command,
+)
 
 MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
@@ -78,7 +84,7 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         summary=run.summary,
         start=start,
         headline=format_headline(run),
-        **_describe_twin_verdict(run),
+        **_describe_verdicts(run),
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
         images=embed_images(other_pictures),
         motion_images=embed_images(motion_pictures),
@@ -111,13 +117,15 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
     )
 
 
-def _describe_twin_verdict(run: ReportData) -> dict[str, Any]:
-    """Return the values of the page for the verdict on the twin; None without one."""
+def _describe_verdicts(run: ReportData) -> dict[str, Any]:
+    """Return the values of the page for the verdicts on excitation and twin; None without one."""
     verdict = run.summary.get("twin_verdict")
     if verdict is None or verdict["reason"] == NOTHING_MEASURED:
         return {"twin_verdict": None}
     return {
         "twin_verdict": verdict,
+        "excitation_verdict": run.summary.get("excitation_verdict"),
+        "misfit": format_misfit(verdict),
         "worst": describe_worst(verdict["worst"]) if verdict["worst"] else None,
         "next_command": name_command(verdict, run.recording.path.parent),
         "format_jump": format_jump,

@@ -11,6 +11,7 @@ from pathlib import Path
 from twin.laws.library import find_effect
 from twin.recording.reader import Recording
 from twin.results.summary import Json
+from twin.results.twin_verdict import format_misfit
 
 RESPONSES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 BASE_UNITS = {
@@ -50,7 +51,10 @@ def compare_summaries(first: ComparedRun, second: ComparedRun) -> Json:
                 name for run in runs for name in run.summary.get("comparison") or {}
             )
         },
-        "estimates": _pair_estimates(*(run.summary.get("estimates") or {} for run in runs)),
+        "estimates": _pair_estimates(
+            *(run.summary.get("estimates") or {} for run in runs),
+            is_one_model=first.parameters == second.parameters,
+        ),
         "model": [
             {
                 "name": name,
@@ -74,7 +78,8 @@ def _describe_run(run: ComparedRun) -> Json:
         **{key: info.get(key) for key in ("id", "title", "started_at", "gap_m", "model")},
         "verdict": run.summary["verdict"],
         "twin_verdict": twin.get("verdict"),
-        "misfit": twin.get("misfit"),
+        "excitation_verdict": (run.summary.get("excitation_verdict") or {}).get("verdict"),
+        "misfit": format_misfit(twin),
         "warnings": len(run.summary.get("warnings") or ()),
         "steps": len(run.summary["steps"]),
     }
@@ -131,8 +136,14 @@ def _channel_error(run: ComparedRun, channel: str, key: str) -> float | None:
     return error.get(key)
 
 
-def _pair_estimates(first: Mapping[str, Json], second: Mapping[str, Json]) -> list[Json]:
-    """Return the parameters estimated in both runs, their change and its standard deviations."""
+def _pair_estimates(
+    first: Mapping[str, Json], second: Mapping[str, Json], *, is_one_model: bool
+) -> list[Json]:
+    """Return the parameters estimated in both runs, their change and its standard deviations.
+
+    An estimate holds beside the effects of its own model, so a change between two models is none of
+    the specimen: it has no standard deviations.
+    """
     pairs = []
     for name in first:
         if name not in second:
@@ -140,7 +151,7 @@ def _pair_estimates(first: Mapping[str, Json], second: Mapping[str, Json]) -> li
         a, b = first[name], second[name]
         change = b["value"] - a["value"]
         sd = math.hypot(a["sd"] or 0.0, b["sd"] or 0.0)
-        sigma = abs(change) / sd if sd else None
+        sigma = abs(change) / sd if sd and is_one_model else None
         pairs.append(
             {
                 "name": name,

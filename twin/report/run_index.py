@@ -29,7 +29,9 @@ class RunRow:
     gap_m: float | None
     verdict: str | None
     twin_verdict: str | None
-    misfit: float | None  # of u in multiples of the noise
+    excitation_verdict: str | None
+    misfit: float | None  # of u in multiples of the noise: median over the steps
+    misfit_worst: float | None  # the same at the worst step
     nrmse: float | None  # of u, restarted twin
     warnings: int | None
     dropouts: int | None
@@ -99,11 +101,12 @@ def _read_row(root: Path, folder: Path) -> RunRow:
         return RunRow(
             str(folder.relative_to(root)), info.get("started_at"), info.get("name"),
             info.get("title"), info.get("source"), info.get("gap_m"), summary.get("verdict"),
-            twin.get("verdict"), twin.get("misfit"), error.get("nrmse"),
+            twin.get("verdict"), (summary.get("excitation_verdict") or {}).get("verdict"),
+            twin.get("misfit"), twin.get("misfit_worst"), error.get("nrmse"),
             None if warnings is None else len(warnings), summary.get("gaps"), info.get("model"),
         )  # fmt: skip
     except (OSError, ValueError, KeyError, TypeError):
-        return RunRow(str(folder.relative_to(root)), *[None] * 12)
+        return RunRow(str(folder.relative_to(root)), *[None] * 14)
 
 
 def rows_to_json(rows: Iterable[RunRow]) -> list[dict[str, Any]]:

@@ -36,9 +36,9 @@ def print_runs(folder: Path, as_json: bool, page: Path | None) -> None:
 
 def _make_table(rows: list[RunRow]) -> Table:
     table = Table(title="Runs, the newest first; misfit of u")
-    for head in ("folder", "date", "test", "gap [mm]", "test ended", "twin", "misfit [%]",
-                 "x noise", "warnings", "dropouts"):  # fmt: skip
-        is_number = head.endswith("]") or head in ("x noise", "warnings", "dropouts")
+    for head in ("folder", "date", "test", "gap [mm]", "test ended", "excitation", "twin",
+                 "misfit [%]", "x noise", "worst", "warnings", "dropouts"):  # fmt: skip
+        is_number = head.endswith("]") or head in ("x noise", "worst", "warnings", "dropouts")
         table.add_column(head, justify="right" if is_number else "left")
     for row in rows:
         table.add_row(
@@ -47,9 +47,11 @@ def _make_table(rows: list[RunRow]) -> Table:
             row.test or "-",
             _format(row.gap_m, 1e3),
             _colour(row.verdict or "no summary"),
+            _colour(row.excitation_verdict or "-"),
             _colour(row.twin_verdict or "-"),
             _format(row.nrmse, 100, 2),
             _format(row.misfit, 1, 2),
+            _format(row.misfit_worst, 1, 2),
             "-" if row.warnings is None else str(row.warnings),
             "-" if row.dropouts is None else str(row.dropouts),
         )
@@ -61,5 +63,5 @@ def _format(value: float | None, scale: float, digits: int = 4) -> str:
 
 
 def _colour(word: str) -> Text:
-    is_bad = word in ("aborted", "halted", "departs", "no summary")
+    is_bad = word in ("aborted", "halted", "departs", "missed", "no summary")
     return Text(replace_escapes(word), style=COLOURS.get(word, "red" if is_bad else ""))

@@ -107,6 +107,14 @@ class StepMisfit(Contract):
     )
 
 
+class StepBranch(Contract):
+    """Whether the free-running twin is on the branch of the specimen at a step."""
+
+    is_same: bool = Field(description="eta_d and phase are those of the specimen")
+    share: Ratio = Field(description="difference of eta_d over its tolerance")
+    free_error: Ratio = Field(description="rms error of u over the rms of u; null if unknown")
+
+
 class StepKey(BaseModel):
     """Keys that a step has in every file, old ones too; it may have more."""
 
@@ -123,8 +131,14 @@ class StepEntry(StepKey, Contract):
     table_acc_peak_m_s2: Acceleration = Field(description="peak of the table acceleration")
     table_acc_fundamental_m_s2: Acceleration = Field(description="its fundamental amplitude")
     thd: Ratio = Field(description="its total harmonic distortion")
+    demanded_m_s2: Acceleration = Field(
+        None, description="demanded fundamental of the table; absent in old files"
+    )
     agreement: dict[str, StepMisfit] | None = Field(
         None, description="of the restarted twin by channel; absent without a comparison"
+    )
+    branch: StepBranch | None = Field(
+        None, description="of the free-running twin; absent without a comparison"
     )
 
 
@@ -163,6 +177,30 @@ class WorstMisfit(StepMisfit):
     band: SI = Field(description="tolerance; null for a whole history")
 
 
+class WorstBranch(Contract):
+    """Step at which the responses of specimen and free twin differ most."""
+
+    step: int = Field(description="number of the step")
+    direction: Direction = Field(description="its direction")
+    frequency_hz: Hertz = Field(description="its frequency")
+    measured: Ratio = Field(description="eta_d of the specimen")
+    twin: Ratio = Field(description="eta_d of the twin")
+    free_error: Ratio = Field(description="rms error of u over the rms of u; null if unknown")
+
+
+class ExcitationVerdict(Contract):
+    """Verdict on what the table played; see `twin.results.excitation_verdict`."""
+
+    verdict: Literal["reached", "missed", "not judged"] = Field(
+        description="whether the table played the level of the steps, or the record"
+    )
+    reason: str = Field(description="what decided it")
+    outside: int = Field(description="steps, or demands on a record, that were missed")
+    worst_error: Ratio = Field(
+        description="relative error of the level at the worst step, or rms error of a record"
+    )
+
+
 class TwinVerdict(Contract):
     """Verdict on the twin, apart from that on the test; see `twin.results.twin_verdict`."""
 
@@ -172,9 +210,14 @@ class TwinVerdict(Contract):
     reason: str = Field(description="what decided it")
     tolerance: str = Field(description="definition of the band")
     worst: WorstMisfit | None = Field(description="null if nothing could be judged")
+    worst_branch: WorstBranch | None = Field(
+        None, description="null if the free twin is on the branch of the specimen everywhere"
+    )
     steps_outside: int = Field(description="steps with u or a outside the band")
+    steps_apart: int = Field(0, description="steps with the free twin on another branch")
     steps_judged: int = Field(description="steps with a band")
     misfit: Ratio = Field(description="of u in multiples of the noise: median over the steps")
+    misfit_worst: Ratio = Field(None, description="the same at the worst step")
     missing_jumps: list[Jump] = Field(description="jumps of the twin that the rig does not show")
     unexpected_jumps: list[Jump] = Field(description="jumps of the rig that the twin lacks")
     warnings: int = Field(description="warnings of the condition monitoring")
@@ -498,6 +541,9 @@ class RunSummary(SummaryKeys, Contract):
     comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
     estimates: dict[str, ParameterEstimate] = Field(description="by parameter")
     warnings: list[WarningEntry] = Field(description="warnings of the condition monitoring")
+    excitation_verdict: ExcitationVerdict | None = Field(
+        None, description="whether the table played the test; absent in old files"
+    )
     twin_verdict: TwinVerdict | None = Field(
         None, description="on the twin, apart from `verdict` on the test; absent in old files"
     )

@@ -40,12 +40,15 @@ from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
 from twin.results.contracts import Contract, RunSummary
+from twin.results.excitation_verdict import judge_excitation
 from twin.results.orbits import find_measured_folds, summarise_orbits
 from twin.results.table_motion import format_tracking, summarise_tracking
 from twin.results.twin_verdict import (
+    compare_branches,
     find_clipped_cycles,
     judge_twin,
     list_clipped_channels,
+    sum_free_errors,
     summarise_agreement,
 )
 from twin.results.windows import summarise_windows
@@ -76,9 +79,26 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         clipped,
     )
 
+    demanded: dict[int, Step | StepAdded] = {step.index: step for step in start.steps}
+    demanded |= {addition.step: addition for addition in recording.records(StepAdded)}
+    measured_cycles = profile.sweep.measured_cycles if start.steps and points else 0
+    free_errors = sum_free_errors(
+        recording.records(Comparison),
+        points,
+        {index: measured_cycles / step.frequency_hz for index, step in demanded.items()},
+        start.rate_hz,
+    )
+    noise_m = _compared_noise(noise, "rel_disp_m")
+
     def describe_step(point: PrcPoint) -> Json:
         entry = _step_entry(point)
-        return entry | ({"agreement": agreement[point.step]} if point.step in agreement else {})
+        if point.step in demanded:
+            entry["demanded_m_s2"] = demanded[point.step].acceleration_m_s2
+        if point.step in agreement:
+            entry["agreement"] = agreement[point.step]
+        free_error = free_errors.get(point.step, math.nan)
+        branch = compare_branches(point, free_error, noise_m, u_star)
+        return entry | ({} if branch is None else {"branch": branch})
 
     stop = recording.stop
     summary = {
@@ -120,6 +140,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         "estimates": _estimates_entry(recording.records(Estimate)),
         "warnings": _warning_entries(recording, clipped),
     }
+    summary["excitation_verdict"] = judge_excitation(summary, profile)
     return summary | {"twin_verdict": judge_twin(summary)}
 
 

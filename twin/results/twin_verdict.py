@@ -1,26 +1,32 @@
-"""Verdict on the twin: does it agree with the rig, or depart from it?
+"""The verdict on the twin of a run, said once: does it agree with the rig, or depart from it?
 
-The twin is judged where it can be: the twin restarted from the measured state, step by step,
-against 3 x noise at rest + 5 % of the amplitude (`twin.compare.monitoring.agreement`). This holds
-for chaotic motions too, on which the free-running twin cannot stay. The median over the held
-cycles of a step counts, so that neither the jump itself nor a filter that settles is a misfit. Of
-the free-running twin only the jumps are judged: it must jump within a step of the grid, or within
-the uncertainty of a gap. A displacement history has no cycles: its NRMSE is judged, against
-sqrt(noise^2 + 5 %^2).
+It agrees if all of this holds, and every surface shows what is said here:
 
-One step outside is a departure; agreement needs at least half of the measured steps judged, and
-holds for what was measured: the reason states its share of the planned steps.
+- The twin restarted from the measured state stays within 3 x noise at rest + 5 % of the amplitude
+  (`twin.compare.monitoring.agreement`), step by step. This holds for chaotic motions too, on which
+  the free-running twin cannot stay. The median over the held cycles of a step counts, so that
+  neither the jump itself nor a filter that settles is a misfit. A bumper touched 0.1 mm too early
+  or late belongs to every set-up, so its share of the error is added to the band.
+- The free-running twin is on the same branch at every step: eta_d within a tenth and the scatter
+  over the cycles, noise and set-up added; where both motions are periodic, with an error below the
+  motion itself, that is a phase within 60 degrees.
+- Every jump is in its place: within a step of the grid, and within 2 % of its frequency.
+- The monitoring has not warned of a disagreement.
+- The excitation was reached (`excitation_verdict`): else the twin followed another test.
+
+At least half of the measured steps must be judged. A displacement history has no cycles: its NRMSE
+is judged, against sqrt(noise^2 + 5 %^2). Forces are not judged by step, because the cells of a side
+may share their force unequally; the monitoring judges their sum.
 
 A step in which a sensor of the motion was off its range (clipped) says nothing about the twin.
 
-A bumper touched 0.1 mm too early or late belongs to every set-up, so its share of the error is
-added to the band. Forces are not judged by step, because the cells of a side may share their force
-unequally; the monitoring judges their sum, and its warning counts here.
+"Times the noise" is one number everywhere: rms error of u of the restarted twin over the noise at
+rest, the median over the steps, and that of the worst step next to it.
 """
 
 import math
 import shlex
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +34,8 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement
+from table_io.records import Agreement, Comparison, PrcPoint
+from twin.compare.curves import MIN_JUMP_RATIO, compare_amplitudes
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
     GAP_ERROR_M,
@@ -51,7 +58,10 @@ MOTION_SENSORS = (
 CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
 PHASES = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
-JUMP_KINDS = ("no jump", "unexpected jump")  # hints, where one direction alone shows no branches
+# Range of eta_d over the cycles, relative to its mean, up to which a motion counts as periodic and
+# has a phase.
+MAX_PERIODIC_SPREAD = 0.05
+MAX_FREE_ERROR = 1.0  # of a periodic motion, over the motion itself: a phase of 60 degrees
 MAX_UNREMARKABLE_MISFIT = 3.0  # times the noise: beyond it, parameters or effects can be found
 NOTHING_MEASURED = "nothing was measured that the twin predicts"
 HISTORY_TOLERANCE_TEXT = f"{100 * AMPLITUDE_TOLERANCE:g} % of the rms, beyond the noise"
@@ -193,6 +203,59 @@ def _summarise_step(
     return entry
 
 
+def compare_branches(
+    point: PrcPoint, free_error: float, noise_m: float, u_star_m: float | None
+) -> Json | None:
+    """Return whether the free twin is on the branch of the specimen at a step; None if unknown.
+
+    `free_error` is its rms error of u over the rms of u, in the measured cycles; `share` is the
+    difference of eta_d over its tolerance.
+    """
+    measured, twin = point.measured, point.twin
+    if measured is None or twin is None or not u_star_m:
+        return None
+    gap_error_m = GAP_ERROR_M if any((*measured.impacts_right, *measured.impacts_left)) else 0.0
+    noise_m = NOISE_FACTOR * noise_m if math.isfinite(noise_m) else 0.0
+    share = compare_amplitudes(measured, twin, (noise_m + gap_error_m) / u_star_m)
+    if not math.isfinite(share):
+        return None
+    is_periodic = max(measured.spread, twin.spread) <= MAX_PERIODIC_SPREAD
+    is_opposed = is_periodic and free_error > MAX_FREE_ERROR
+    return {
+        "is_same": share <= 1 and not is_opposed,
+        "share": share,
+        "free_error": free_error if math.isfinite(free_error) else None,
+    }
+
+
+def sum_free_errors(
+    comparisons: Sequence[Comparison],
+    points: Iterable[PrcPoint],
+    measured_s: Mapping[int, float],
+    rate_hz: float,
+) -> dict[int, float]:
+    """Return by step the rms error of u of the free twin over the rms of u; NaN if unknown.
+
+    Over the measured cycles, which last `measured_s` and end where the point of the step was made.
+    """
+    known = [each for each in comparisons if JUDGED_CHANNELS[0] in each.channels]
+    if not known:
+        return {}
+    column = known[0].channels.index(JUDGED_CHANNELS[0])
+    ends = np.array([each.index + each.count for each in known])
+    squares = np.array([(each.free_error_ss[column], each.measured_ss[column]) for each in known])
+    squares[~np.isfinite(squares).all(axis=1)] = 0.0  # lost samples, or before the start
+    error, motion = np.vstack([np.zeros(2), np.cumsum(squares, axis=0)]).T
+    ratios = {}
+    for point in points:
+        start = point.index - measured_s.get(point.step, 0.0) * rate_hz
+        first, last = np.searchsorted(ends, [start + 0.5, point.index + 0.5])
+        total = motion[last] - motion[first]
+        ratio = (error[last] - error[first]) / total if total > 0 else math.nan
+        ratios[point.step] = math.sqrt(ratio) if ratio >= 0 else math.nan
+    return ratios
+
+
 def judge_twin(summary: Mapping[str, Any]) -> Json:
     """Return the entry `twin_verdict` of a summary, from its other entries alone."""
     worst = _find_worst(summary)
@@ -206,19 +269,23 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
     )
     missing = _list_unmatched(modelled[0], *measured, grid)
     unexpected = _list_unmatched(measured[0], *modelled, grid)
+    apart = [*_list_steps_apart(summary, measured[0], modelled[0])]
+    worst_branch = max(apart, key=_measure_departure, default=None)
     warnings = summary.get("warnings") or []
-    is_one_way = len({step["direction"] for step in summary["steps"]}) == 1
-    kinds = (DEPARTURE_KIND, *(JUMP_KINDS if is_one_way else ()))
     departures = [
         warning
         for warning in warnings
-        if warning["kind"] in kinds and not warning.get("is_clipped")
+        if warning["kind"] == DEPARTURE_KIND and not warning.get("is_clipped")
     ]
+    judged = _count_judged(summary)
     reasons = []
     if outside:
-        reasons.append(f"{len(outside)} of {_count_judged(summary)} steps outside the tolerance")
+        reasons.append(f"{len(outside)} of {judged} steps outside the tolerance")
     elif worst and worst["share"] > 1:
         reasons.append("the history is outside the tolerance")
+    if worst_branch:
+        count = f"{len(apart)} step{'s' if len(apart) > 1 else ''}"
+        reasons.append(f"another response at {count}: {describe_branch(worst_branch)}")
     reasons += [
         f"{len(items)} {noun}{'s' if len(items) > 1 else ''}"
         for items, noun in (
@@ -228,11 +295,10 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
         )
         if items
     ]
-    judged = _count_judged(summary)
-    is_covered = 2 * judged >= len(summary["steps"])
-    misfit = _overall_misfit(summary)
     planned, clipped = _count_planned(summary), summary.get("clipped_steps") or ()
-    if (summary.get("run") or {}).get("source") == "model" or worst is None:
+    misfits = _list_misfits(summary)
+    misfit = float(np.median(misfits)) if misfits else None
+    if (summary.get("run") or {}).get("source") == "model" or (worst is None and not apart):
         verdict, reasons = "not judged", [_explain_no_tolerance(summary)]
     elif not planned and summary.get("clipped_channels"):
         channels = ", ".join(summary["clipped_channels"])
@@ -240,12 +306,7 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
     elif reasons:
         verdict = "departs"
     else:
-        verdict = "agrees" if is_covered else "not judged"
-        reasons = ["within the tolerance"] if is_covered else ["too few steps can be judged"]
-        if is_covered and summary["steps"] and summary["verdict"] == "complete":
-            reasons.append("every jump in its place")
-        if _is_remarkable(misfit):
-            reasons.append(f"but u differs by {misfit:.2g} times the noise")
+        verdict, reasons = _judge_agreement(summary, judged, misfit)
     if worst and judged < planned:
         reasons.append(f"{judged} of {planned} steps judged")
     if worst and clipped:
@@ -255,14 +316,91 @@ def judge_twin(summary: Mapping[str, Any]) -> Json:
         "reason": ", ".join(reasons),
         "tolerance": TOLERANCE_TEXT if planned else HISTORY_TOLERANCE_TEXT,
         "worst": worst,
+        "worst_branch": worst_branch,
         "steps_outside": len(outside),
+        "steps_apart": len(apart),
         "steps_judged": judged,
         "misfit": misfit,
+        "misfit_worst": max(misfits, default=None),
         "missing_jumps": missing,
         "unexpected_jumps": unexpected,
         "warnings": len(warnings),
         "next_command": _suggest_command(summary, verdict, misfit),
     }
+
+
+def _judge_agreement(
+    summary: Mapping[str, Any], judged: int, misfit: float | None
+) -> tuple[str, list[str]]:
+    """Return the verdict on a twin of which nothing departs, and its reasons."""
+    if 2 * judged < len(summary["steps"]):
+        return "not judged", ["too few steps can be judged"]
+    reasons = ["within the tolerance"]
+    if summary["steps"] and summary["verdict"] == "complete":
+        reasons.append("on the same branch at every step, every jump in its place")
+    if _is_remarkable(misfit):
+        reasons.append(f"but u differs by {misfit:.2g} times the noise")
+    if (summary.get("excitation_verdict") or {}).get("verdict") == "missed":
+        return "not judged", [*reasons, "but the table did not play this test"]
+    return "agrees", reasons
+
+
+def _list_steps_apart(
+    summary: Mapping[str, Any], jumps: Sequence[Json], twin_jumps: Sequence[Json]
+) -> Iterator[Json]:
+    """Yield the steps at which the free twin is on another branch than the specimen.
+
+    But those between a jump and its counterpart, where one came a step of the grid later.
+    """
+    clipped = summary.get("clipped_steps") or ()
+    for step in summary["steps"]:
+        branch = step.get("branch")
+        if branch is None or branch["is_same"] or step["index"] in clipped:
+            continue
+        if not any(
+            _is_between(step, jump, other)
+            for jump in jumps
+            for other in twin_jumps
+            if _is_same_jump(jump, other)
+        ):
+            measured, twin = (step[source]["eta_d"] for source in ("measured", "twin"))
+            yield {
+                "step": step["index"],
+                "direction": step["direction"],
+                "frequency_hz": step["frequency_hz"],
+                "measured": measured,
+                "twin": twin,
+                "free_error": branch["free_error"],
+            }
+
+
+def _is_between(step: Json, jump: Json, other: Json) -> bool:
+    """Return whether a step lies after one of two jumps and before the other."""
+    first, last = sorted((jump["to_hz"], other["to_hz"]))
+    if step["direction"] != jump["direction"]:
+        return False
+    if step["direction"] == "forward":
+        return bool(first <= step["frequency_hz"] < last)
+    return bool(first < step["frequency_hz"] <= last)
+
+
+def _measure_departure(entry: Json) -> float:
+    """Return how far two eta_d are apart, as a ratio of at least 1."""
+    low, high = sorted((entry["measured"], entry["twin"]))
+    return float(high / low) if low > 0 else math.inf
+
+
+def describe_branch(entry: Mapping[str, Any]) -> str:
+    """Describe a step at which the twin responds in another way than the specimen."""
+    kind = "opposite in phase"
+    if entry["measured"] != entry["twin"] and (entry["free_error"] or 0.0) <= MAX_FREE_ERROR:
+        kind = "another amplitude"
+    if _measure_departure(dict(entry)) >= MIN_JUMP_RATIO:
+        kind = "another branch"
+    return (
+        f"{entry['frequency_hz']:g} Hz {entry['direction']}, {kind}, eta_d {entry['measured']:.3f} "
+        f"measured, {entry['twin']:.3f} of the twin"
+    )
 
 
 def _band_shares(step: Mapping[str, Any]) -> dict[str, float]:
@@ -333,22 +471,31 @@ def _find_worst(summary: Mapping[str, Any]) -> Json | None:
     }  # fmt: skip
 
 
-def _overall_misfit(summary: Mapping[str, Any]) -> float | None:
-    """Return the median over the steps of the misfit of u in multiples of the noise.
+def _list_misfits(summary: Mapping[str, Any]) -> list[float]:
+    """Return the misfit of u in multiples of the noise at each step.
 
-    Of a displacement history it is NRMSE over noise floor.
+    Of a displacement history, one: NRMSE over noise floor.
     """
     misfits = [
-        entry["misfit"]
+        float(entry["misfit"])
         for step in summary["steps"]
         if (entry := (step.get("agreement") or {}).get(JUDGED_CHANNELS[0])) and entry["misfit"]
     ]
     if misfits:
-        return float(np.median(misfits))
+        return misfits
     error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
     if error.get("nrmse") is None or not error.get("noise_floor"):
-        return None
-    return float(error["nrmse"] / error["noise_floor"])
+        return []
+    return [float(error["nrmse"] / error["noise_floor"])]
+
+
+def format_misfit(verdict: Mapping[str, Any]) -> str:
+    """Format the misfit of u in multiples of the noise: median and worst step; "" if unknown."""
+    median, worst = verdict.get("misfit"), verdict.get("misfit_worst")
+    if median is None:
+        return ""
+    text = f"{median:.2g} times the noise"
+    return text if worst is None or worst == median else f"{text} (worst step {worst:.2g})"
 
 
 def _list_unmatched(
@@ -360,13 +507,6 @@ def _list_unmatched(
     reaches that end: the counterpart may lie beyond.
     """
 
-    def matches(jump: Json, other: Json) -> bool:
-        if (jump["direction"], jump["kind"]) != (other["direction"], other["kind"]):
-            return False
-        steps = abs(_grid_index(grid, jump["to_hz"]) - _grid_index(grid, other["to_hz"]))
-        distance_hz = abs(jump["to_hz"] - other["to_hz"])
-        return steps <= 1 or distance_hz <= JUMP_TOLERANCE * jump["to_hz"]
-
     def leaves_range(jump: Json) -> bool:
         end = grid[-1] if jump["direction"] == "forward" else grid[0]
         reached = any(end in (entry["from_hz"], entry["to_hz"]) for entry in intervals)
@@ -375,12 +515,17 @@ def _list_unmatched(
     return [
         jump
         for jump in jumps
-        if not leaves_range(jump) and not any(matches(jump, other) for other in others)
+        if not leaves_range(jump) and not any(_is_same_jump(jump, other) for other in others)
     ]
 
 
-def _grid_index(grid: Sequence[float], frequency_hz: float) -> int:
-    return int(np.argmin(np.abs(np.array(grid) - frequency_hz)))
+def _is_same_jump(jump: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Return whether two jumps are one: within a step of the grid, and within 2 % of frequency."""
+    if (jump["direction"], jump["kind"]) != (other["direction"], other["kind"]):
+        return False
+    grid_step_hz = abs(jump["to_hz"] - jump["from_hz"])
+    tolerance_hz = min(grid_step_hz, JUMP_TOLERANCE * jump["to_hz"])
+    return abs(jump["to_hz"] - other["to_hz"]) <= tolerance_hz * (1 + 1e-9)
 
 
 def _is_remarkable(misfit: float | None) -> bool:
@@ -403,6 +548,8 @@ def _suggest_command(summary: Mapping[str, Any], verdict: str, misfit: float | N
 def format_twin_verdict(verdict: Mapping[str, Any], folder: Path) -> list[str]:
     """Return the lines of a verdict for the console: verdict, worst place, jumps, next command."""
     lines = [f"twin {verdict['verdict']}: {verdict['reason']}"]
+    if misfit := format_misfit(verdict):
+        lines.append(f"misfit of u: {misfit}")
     if worst := verdict["worst"]:
         lines.append(f"worst: {describe_worst(worst)}; tolerance {verdict['tolerance']}")
     for name in ("missing", "unexpected"):

@@ -12,11 +12,11 @@ from twin.compare.monitoring import jumps
 from twin.compare.monitoring.agreement import AgreementState, check_agreement
 from twin.compare.monitoring.attractor_change import AttractorState, detect_attractor_change
 from twin.compare.monitoring.cycle import ChannelNoise, CycleData, MonitoringSetup
-from twin.compare.monitoring.jumps import JumpPrediction, JumpTracking
+from twin.compare.monitoring.jumps import ExpectedJump, JumpTracking
 from twin.compare.monitoring.parameter_drift import DriftState, update_estimate
 from twin.compare.monitoring.sensor_consistency import ConsistencyState, check_consistency
 
-# Kinds of its Events. "jump" occurred where the model expects it; all others are warnings.
+# Kinds of its Events. A "jump" came with that of the twin; all others are warnings.
 EVENT_KINDS = (
     "jump", "unexpected jump", "no jump", "disagreement", "drift", "attractor", "instrument",
 )  # fmt: skip
@@ -34,9 +34,9 @@ class MonitoringState:
     jump_tracking: JumpTracking = field(default_factory=JumpTracking)
 
 
-def start_monitoring(prediction: JumpPrediction) -> MonitoringState:
-    """Return the state before the first sample, with the predicted jumps."""
-    return MonitoringState(jump_tracking=jumps.start_tracking(prediction))
+def start_monitoring(expected_jumps: tuple[ExpectedJump, ...]) -> MonitoringState:
+    """Return the state before the first sample, with the jumps that the twin will show."""
+    return MonitoringState(jump_tracking=JumpTracking(expected_jumps))
 
 
 def update_noise(state: MonitoringState, block: Block) -> MonitoringState:
