@@ -121,7 +121,7 @@ def _describe_verdicts(run: ReportData) -> dict[str, Any]:
     """Return the values of the page for the verdicts on excitation and twin; None without one."""
     verdict = run.summary.get("twin_verdict")
     if verdict is None or verdict["reason"] == NOTHING_MEASURED:
-        return {"twin_verdict": None}
+        return {"twin_verdict": None, "excitation_verdict": None, "misfit": ""}
     return {
         "twin_verdict": verdict,
         "excitation_verdict": run.summary.get("excitation_verdict"),
