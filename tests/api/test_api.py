@@ -1,12 +1,17 @@
 """The Python interface: logs, fits and verdicts as objects."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.builders.rigs import read_rig_text
+from tests.builders.truths import seal_truth
 from tests.input_errors import raises_input_error
 from twin import api
+from twin.discovery.command import run_discovery, run_identification
+from twin.laws.library import EFFECTS
 from twin.model.config import ModelConfig
 from twin.setup.run_config import RunConfig, read_model
 
@@ -76,3 +81,51 @@ def test_a_discovery_has_the_verdict_and_the_model(log_file: Path, tmp_path: Pat
     assert config.effects == ()
     with raises_input_error(problem="effect 'no_effect'"):
         api.discover([log_file], without=["no_effect"])
+
+
+HIDDEN_SPRING = '[[effects]]\nid = "saturating_stiffness"\nparameters = { stiffness = 4000.0, length = 0.006 }\n'
+TEST = """
+title = "short"
+rig = "rig.toml"
+[specimen]
+mass_kg = 550.0
+gap_mm = inf
+[sweep]
+start_hz = 1.0
+stop_hz = 2.0
+step_hz = 0.2
+cycles = 4
+acceleration_g = 0.05
+[acquisition]
+rate_hz = 500.0
+block_samples = 50
+[loop_check]
+enabled = false
+[control]
+enabled = false
+"""
+
+
+@pytest.mark.slow  # two searches of a law
+@pytest.mark.parametrize("truth", ["", HIDDEN_SPRING])
+def test_discover_and_identify_return_what_the_commands_write(truth: str, tmp_path: Path) -> None:
+    """No effect of the library is tried, so that a law is searched for what is hidden."""
+    keys = seal_truth(tmp_path, truth) if truth else {}
+    entries = "".join(f'{key} = "{value}"\n' for key, value in keys.items())
+    (tmp_path / "rig.toml").write_text(f"{read_rig_text('simulated')}{entries}")
+    (tmp_path / "test.toml").write_text(TEST)
+    log = api.run_simulated(tmp_path / "test.toml", tmp_path / "run").path
+    without = [effect.id for effect in EFFECTS]
+
+    found = api.discover([log], without=without)
+    run_discovery([log], "snm", tmp_path / "found", without)
+    written = json.loads((tmp_path / "found" / "verdict.json").read_text())
+    assert json.loads(found.verdict.to_json()) | {"seconds": 0} == written | {"seconds": 0}
+    assert found.model_toml == (tmp_path / "found" / "model.toml").read_text()
+    assert (found.verdict.law is not None) == bool(truth)
+
+    fitted = api.identify([log])
+    run_identification([log], "snm", tmp_path / "fitted.toml")
+    written = json.loads((tmp_path / "fitted" / "identify.json").read_text())
+    assert json.loads(fitted.report.to_json()) | {"seconds": 0} == written | {"seconds": 0}
+    assert fitted.model_toml == (tmp_path / "fitted.toml").read_text()

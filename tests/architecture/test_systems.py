@@ -29,7 +29,7 @@ for line in sys.argv[1:]:
     except SystemExit as ended:
         codes.append(ended.code)
 print("codes", *codes)
-import twin.log, twin.discovery.identify_command, twin.discovery.discover_command
+import twin.log, twin.discovery.command
 import twin.cli.simulate, twin.demo.command
 import twin.campaign.report, twin.exchange.import_table, twin.monitor.app, twin.studies.command
 """

@@ -13,12 +13,9 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from twin.discovery import decide_command as decide
-from twin.discovery import decisive_test
-from twin.discovery import discover_command as discover
-from twin.discovery.decide_command import DecideOptions, parse_options, play_decisive_tests
-from twin.discovery.discover_command import judge_logs
-from twin.discovery.serialize import Json
+from twin.discovery import command, decide, decisive_test
+from twin.discovery.command import parse_options, run_decision, run_discovery
+from twin.discovery.decisive_test import DecideOptions
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
 from twin.report.finalize import EXIT_INTERRUPTED
@@ -76,7 +73,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def few_tests(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two short candidates: quick to simulate."""
 
-    def list_two(profile: Profile) -> Iterator[tuple[str, Json]]:
+    def list_two(profile: Profile) -> Iterator[tuple[str, dict[str, Any]]]:
         chosen = [pair for pair in list_excitations(profile) if "higher freq" in pair[0]]
         yield from chosen[2:4]  # the loudest
 
@@ -87,7 +84,7 @@ def few_tests(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def without_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """No figures: they take most of the time."""
-    monkeypatch.setattr(discover, "write_discovery_page", lambda *_: None)
+    monkeypatch.setattr(command, "write_discovery_page", lambda *_: None)
 
 
 def read_verdict(folder: Path) -> dict[str, Any]:
@@ -106,7 +103,7 @@ def make_answers(*replies: str) -> Callable[..., str]:
 def test_the_proposal_is_a_profile_that_check_and_run_load(plain: Path, tmp_path: Path) -> None:
     profile = tmp_path / "next.toml"
     options = DecideOptions(profile, rig=str(plain.parent / "rig.toml"))
-    assert judge_logs([plain], "snm", tmp_path / "out", OTHERS, (), options).code == 0
+    assert run_discovery([plain], "snm", tmp_path / "out", OTHERS, (), options)[1] == 0
     config = read_run_config(profile)
     verdict = read_verdict(tmp_path / "out")["decide"]
     assert config.profile.title == f"{verdict['title']}: {verdict['purpose']}"
@@ -126,7 +123,7 @@ def test_the_operator_is_asked_and_may_stop(
 ) -> None:
     monkeypatch.setattr(terminal.console, "input", make_answers("q"))
     out = tmp_path / "out"
-    code = play_decisive_tests([plain], "snm", out, OTHERS, (), DecideOptions(unpaced=True))
+    code = run_decision([plain], "snm", out, OTHERS, (), DecideOptions(unpaced=True))
     assert code == EXIT_INTERRUPTED
     shown = capsys.readouterr().out
     assert "TEST: sweep, higher frequencies" in shown
@@ -147,7 +144,7 @@ def test_a_refused_test_is_one_message_and_the_next_is_tried(
     monkeypatch.setattr(decide, "run_test", refuse)
     out = tmp_path / "out"
     options = DecideOptions(asks=False, unpaced=True)
-    assert play_decisive_tests([plain], "snm", out, OTHERS, (), options) == 0
+    assert run_decision([plain], "snm", out, OTHERS, (), options) == 0
     lines = capsys.readouterr().out.splitlines()
     messages = [line for line in lines if line.startswith("the rig refuses ")]
     assert len(messages) == len(refused) == 2
@@ -169,7 +166,7 @@ def test_a_rig_without_the_stroke_gets_no_proposal(plain: Path, tmp_path: Path) 
     text = (plain.parent / "rig.toml").read_text()
     weak.write_text(text.replace("acceleration_g = 1.0", "acceleration_g = 0.0001"))
     options = DecideOptions(tmp_path / "next.toml", rig=str(weak))
-    judge_logs([plain], "snm", tmp_path / "out", OTHERS, (), options)
+    run_discovery([plain], "snm", tmp_path / "out", OTHERS, (), options)
     assert not (tmp_path / "next.toml").exists()
     verdict = read_verdict(tmp_path / "out")
     assert verdict["decide"] is None
@@ -196,7 +193,7 @@ def test_the_rig_plays_until_a_hidden_effect_is_named(tmp_path: Path) -> None:
     log = record_run(tmp_path / "first", TRUTH)
     out = tmp_path / "out"
     options = DecideOptions(asks=False, unpaced=True)
-    assert play_decisive_tests([log], "snm", out, (), (), options) == 0
+    assert run_decision([log], "snm", out, (), (), options) == 0
     verdicts = sorted(out.glob("verdict-*"))
     verdict = read_verdict(verdicts[-1])
     chain: Sequence[dict[str, Any]] = verdict["chain"]

@@ -21,6 +21,7 @@ from twin.demo.command import (
     open_seal,
     seal_effect,
 )
+from twin.discovery.result import EffectResult, Interval, Verdict
 from twin.laws.library import EFFECTS
 
 
@@ -62,10 +63,11 @@ def test_the_rig_that_is_kept_hides_what_was_sealed(tmp_path: Path) -> None:
 def test_the_seal_is_compared_with_what_discovery_named(tmp_path: Path) -> None:
     (hidden,) = open_seal(tmp_path, seal_effect(tmp_path, 9)).effects
     name, value = next(iter(hidden.parameters.items()))
-    fit = {name: {"value": 1.01 * value, "low": value, "high": 1.02 * value, "unit": "X"}}
-    right, false = {"id": hidden.id, "parameters": fit}, {"id": "other", "parameters": {}}
+    fit = {name: Interval(value=1.01 * value, low=value, high=1.02 * value, unit="X")}
+    right = EffectResult(id=hidden.id, confidence=0.9, parameters=fit)
+    false = EffectResult(id="other", confidence=0.9, parameters={})
     lines = {
-        key: compare_with_seal(hidden, {"verdict": word, "effects": effects})
+        key: compare_with_seal(hidden, Verdict.model_construct(verdict=word, effects=effects))
         for key, word, effects in (
             ("right", "named", [right]),
             ("more", "named", [right, false]),

@@ -1,12 +1,10 @@
 """Recordings that nothing should be learned from, and what a user is told of them."""
 
 import hashlib
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +14,15 @@ from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.records import SampleGap
 from tests.input_errors import raises_input_error
-from twin.discovery import discover_command as discover
+from twin.discovery import task
+from twin.discovery.build_verdict import REFITTED_SUFFIX
+from twin.discovery.command import run_discovery, run_identification
 from twin.discovery.discover import Discovery, prepare_problem
-from twin.discovery.discover_command import judge_logs
 from twin.discovery.free_running import run_log_free
-from twin.discovery.headline import format_verdict
-from twin.discovery.identify_command import identify_command
 from twin.discovery.loading import load_logs
 from twin.discovery.selection import Cancelled
-from twin.discovery.serialize import REFITTED_SUFFIX
+from twin.discovery.task import DiscoveredModel, discover
+from twin.discovery.words import format_verdict
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
@@ -102,28 +100,17 @@ def change_log(source: Made, folder: Path, change: Callable[[str, Float1D], Floa
     return log
 
 
-def discover_from(
-    logs: list[Path], out: Path, model: str = "snm"
-) -> tuple[dict[str, Any], Discovery]:
-    """verdict.json and what it was made from; nothing is drawn."""
-    discoveries: list[Discovery] = []
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            discover,
-            "write_discovery_page",
-            lambda folder, discovery, *_: discoveries.append(discovery),
-        )
-        assert judge_logs(logs, model, out, NOTHING_NAMED).code == 0
-    return json.loads((out / "verdict.json").read_text()), discoveries[0]
+def discover_from(logs: list[Path], model: str = "snm") -> DiscoveredModel:
+    return discover(logs, model, NOTHING_NAMED)
 
 
-@pytest.mark.parametrize("learn", [judge_logs, identify_command])
+@pytest.mark.parametrize("learn", [run_discovery, run_identification])
 def test_a_log_counts_once_whatever_its_name(
     plain: Made, tmp_path: Path, learn: Callable[..., object]
 ) -> None:
     again = tmp_path / "again.mcap"
     shutil.copy(plain.log, again)
-    out = tmp_path / ("out.toml" if learn is identify_command else "out")
+    out = tmp_path / ("out.toml" if learn is run_identification else "out")
     with raises_input_error(where=again, problem=plain.log):
         learn([plain.log, again], "snm", out)
     assert not out.exists()
@@ -132,7 +119,7 @@ def test_a_log_counts_once_whatever_its_name(
 def test_what_is_in_the_way_is_said_before_the_long_work(tmp_path: Path) -> None:
     (tmp_path / "there").write_text("mine")
     with raises_input_error(key="--out", value=str(tmp_path)):
-        judge_logs([tmp_path / "no.mcap"], "snm", tmp_path)
+        run_discovery([tmp_path / "no.mcap"], "snm", tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["there"]
 
 
@@ -193,19 +180,20 @@ def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:
 @pytest.mark.slow  # a minute: every law is tried
 def test_time_that_runs_backwards_is_no_model_and_no_crash(plain: Made, tmp_path: Path) -> None:
     log = change_log(plain, tmp_path, lambda _, values: values[::-1])
-    verdict, discovery = discover_from([log], tmp_path / "out")
+    result = discover_from([log])
+    verdict, discovery = result.verdict, result.discovery
     sheet, steps = discovery.prepared.problem.log_residuals[0], load_logs([log])[0][0].steps
     assert steps
     assert run_log_free(sheet, steps, discovery.selection.null) is None  # no resonance to scale by
-    assert verdict["verdict"] == "unexplained"
-    assert any("damping = 0 " in text and "bound" in text for text in verdict["notes"])
+    assert verdict.verdict == "unexplained"
+    assert any("damping = 0 " in text and "bound" in text for text in verdict.notes)
 
 
 def test_agreement_with_other_parameters_is_not_agreement(tmp_path: Path) -> None:
     stiff = record_run(tmp_path / "stiff", "[base]\ndamper_stiffness_n_m = 72000.0\n")
-    verdict, _ = discover_from([stiff.log], tmp_path / "out")
-    assert verdict["verdict"] == "none"
-    assert verdict["why"].endswith(REFITTED_SUFFIX)
+    verdict = discover_from([stiff.log]).verdict
+    assert verdict.verdict == "none"
+    assert verdict.why.endswith(REFITTED_SUFFIX)
     assert "agrees only with other parameters" in format_verdict(verdict)
 
 
@@ -213,11 +201,11 @@ def test_an_effect_of_the_model_that_is_not_there_is_said(plain: Made, tmp_path:
     text = (PROFILES_DIR / "models" / "snm.toml").read_text()
     model = tmp_path / "more.toml"
     model.write_text(f'{text}[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = 4e7 }}\n')
-    verdict, _ = discover_from([plain.log], tmp_path / "out", str(model))
-    assert verdict["verdict"] == "none"
-    assert abs(verdict["base"]["bumper_hardening.k2"]["value"]) < 4e6
-    assert any("bumper_hardening" in text and "vanishes" in text for text in verdict["notes"])
-    assert not any("gap" in text for text in verdict["notes"])
+    verdict = discover_from([plain.log], str(model)).verdict
+    assert verdict.verdict == "none"
+    assert abs(verdict.base["bumper_hardening.k2"].value) < 4e6
+    assert any("bumper_hardening" in text and "vanishes" in text for text in verdict.notes)
+    assert not any("gap" in text for text in verdict.notes)
 
 
 def test_enough_before_anything_leaves_nothing(
@@ -226,8 +214,8 @@ def test_enough_before_anything_leaves_nothing(
     def interrupt(*_: object, **__: object) -> Discovery:
         raise Cancelled
 
-    monkeypatch.setattr(discover, "discover_effects", interrupt)
-    assert judge_logs([plain.log], "snm", tmp_path / "out").code == EXIT_INTERRUPTED
+    monkeypatch.setattr(task, "discover_effects", interrupt)
+    assert run_discovery([plain.log], "snm", tmp_path / "out") == (None, EXIT_INTERRUPTED)
     assert not (tmp_path / "out").exists()
 
 

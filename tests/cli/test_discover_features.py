@@ -7,9 +7,9 @@ import pytest
 
 from table_io.config.base import load_config
 from tests.command_line import call_main
+from twin.discovery.result import FeatureVerdict
 from twin.laws.library import EFFECTS
 from twin.model.config import ModelConfig
-from twin.results.contracts import FeatureVerdict
 
 FEATURES = """title = "Two peaks"
 [specimen]

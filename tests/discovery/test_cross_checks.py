@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from twin.discovery.build_verdict import build_interval, build_parameter
 from twin.discovery.cross_checks import SubsetEstimate, list_disagreements
-from twin.discovery.identify_page import format_estimate
 from twin.discovery.least_squares import FitResult
 from twin.discovery.motion import RecordScale
+from twin.discovery.page import format_estimate
 from twin.discovery.parameters import FreeParameter, GapKey, ParameterKey, ParameterSet
-from twin.discovery.serialize import interval_to_json, parameter_to_json
-from twin.results.contracts import Interval
-from twin.results.summary import dump_contract
+from twin.discovery.result import Interval
 
 KEYS: list[ParameterKey] = [GapKey(log) for log in range(12)]
 
@@ -40,9 +39,10 @@ def test_too_few_cycles_give_no_interval() -> None:
     )  # fmt: skip
     assert math.isinf(fit.interval_error(few))
     assert fit.interval_error(many) == 0.1
-    estimate = interval_to_json(36e3, fit.interval_error(few), "N/m")
+    estimate = build_interval(36e3, fit.interval_error(few), "N/m")
     assert format_estimate(estimate) == "36.00 kN/m"
     fitted = replace(fit, values={few: 36e3})
-    parameter = parameter_to_json(fitted, FreeParameter(few, 0.0, 1e6, 1.0, "N/m"))
-    limits = Interval.model_validate_json(dump_contract(Interval, parameter))
+    parameter = build_parameter(fitted, FreeParameter(few, 0.0, 1e6, 1.0, "N/m"))
+    limits = Interval.model_validate_json(parameter.to_json())
+    assert limits == parameter
     assert (limits.value, limits.low, limits.high) == (36e3, None, None)

@@ -30,7 +30,7 @@ from twin.discovery.features.search import (
     run_base_job,
     run_effect_job,
 )
-from twin.discovery.features_summary import judge_discovery
+from twin.discovery.features.task import judge_discovery
 from twin.discovery.parameters import ParameterSet
 from twin.model.config import ModelConfig
 from twin.model.model import Model

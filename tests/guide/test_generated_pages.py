@@ -14,6 +14,7 @@ from table_io.config.rig import RigConfig
 from twin.cli.main import app
 from twin.discovery.features.config import FeatureSet
 from twin.discovery.features.prediction import describe_feature
+from twin.discovery.result import FeatureVerdict
 from twin.guide.gallery import write_gallery
 from twin.guide.loops import compute_loops, find_loops
 from twin.guide.notebook import convert_notebook, list_code
@@ -21,7 +22,6 @@ from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
 from twin.laws.effect import Effect
 from twin.laws.library import EFFECTS
-from twin.results.contracts import FeatureVerdict
 
 
 def test_every_key_of_every_file_has_a_meaning() -> None:

@@ -16,10 +16,10 @@ from tests.recovery.scaled_specimens import (
     record_block,
     start_model,
 )
+from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import Discovery, discover_effects
 from twin.discovery.held_out import compute_force_error
 from twin.discovery.identify import IdentificationResult, identify_parameters
-from twin.discovery.identify_command import identification_to_json
 from twin.discovery.parameters import (
     DAMPING,
     SLIP_SPEED,
@@ -28,7 +28,8 @@ from twin.discovery.parameters import (
     ParameterKey,
     ParameterSet,
 )
-from twin.discovery.serialize import Json, verdict_to_json
+from twin.discovery.result import HeldOutLog, IdentificationReport
+from twin.discovery.task import build_report
 
 FRICTION = Hidden("coulomb_friction", 120.0)
 CUBIC = Hidden("cubic_stiffness", 3e6)
@@ -64,13 +65,13 @@ def plain_nrmse(block: Block, values: dict[ParameterKey, float]) -> float:
     return float((force - model)[used].std() / force[used].std())
 
 
-def discover_and_hold_out(hidden: Hidden) -> tuple[Discovery, Json, Block]:
+def discover_and_hold_out(hidden: Hidden) -> tuple[Discovery, HeldOutLog, Block]:
     """Discover on one record, and judge on another of the same specimen with other noise."""
     discovery = discover_effects([prepare(record_block(hidden), hidden)], start_model())
     apart = record_block(hidden, noise=HELD_OUT_NOISE, seed=11)
     log = prepare(apart, hidden)
-    verdict = verdict_to_json(discovery, held_out_logs=[log], given=start_model())
-    return discovery, verdict["held_out_logs"][0], apart
+    verdict = build_verdict(discovery, held_out_logs=[log], given=start_model())
+    return discovery, verdict.held_out_logs[0], apart
 
 
 @pytest.mark.parametrize("hidden", [FRICTION, CUBIC], ids=lambda hidden: hidden.name)
@@ -83,13 +84,14 @@ def test_the_force_errors_of_a_held_out_log(hidden: Hidden) -> None:
     null = dict(discovery.selection.null.fit.values)
     best = dict(discovery.verdict.best.fit.values)
     for key, values in (("given", given), ("before", null), ("after", best)):
-        assert figures[f"nrmse_{key}"] == pytest.approx(
+        assert getattr(figures, f"nrmse_{key}") == pytest.approx(
             plain_nrmse(apart, values), rel=0.03, abs=0.012
         ), key
-    assert figures["nrmse_after"] < 0.5 * figures["nrmse_before"]
-    assert figures["nrmse_before"] <= figures["nrmse_given"]
+    assert figures.nrmse_after < 0.5 * figures.nrmse_before
+    assert figures.nrmse_given is not None
+    assert figures.nrmse_before <= figures.nrmse_given
     # that of the accelerometer, of the inertia force, and a little of the displacement
-    assert 0.8 * HELD_OUT_NOISE < figures["noise_floor"] < 1.5 * HELD_OUT_NOISE
+    assert 0.8 * HELD_OUT_NOISE < figures.noise_floor < 1.5 * HELD_OUT_NOISE
 
 
 def test_the_speed_of_slip_is_that_of_the_fit() -> None:
@@ -99,7 +101,7 @@ def test_the_speed_of_slip_is_that_of_the_fit() -> None:
     assert SLIP_SPEED in best.values
     log = prepare(record_block(FRICTION, noise=HELD_OUT_NOISE, seed=11), FRICTION)
     without = ParameterSet({k: v for k, v in best.values.items() if k != SLIP_SPEED})
-    assert figures["nrmse_after"] < 0.9 * compute_force_error(log, without).nrmse
+    assert figures.nrmse_after < 0.9 * compute_force_error(log, without).nrmse
 
 
 def test_without_an_accelerometer_force_and_error_have_one_unit() -> None:
@@ -118,10 +120,12 @@ def test_without_an_accelerometer_force_and_error_have_one_unit() -> None:
     assert derived.noise_floor > 3 * known.noise_floor
 
 
-def identify(hidden: Hidden, noise: float = NOISE) -> tuple[IdentificationResult, Json, Block]:
+def identify(
+    hidden: Hidden, noise: float = NOISE
+) -> tuple[IdentificationResult, IdentificationReport, Block]:
     block = record_block(hidden, noise=noise)
     result = identify_parameters([prepare(block, hidden)], [(block,)], start_model())
-    return result, identification_to_json(result, []), block
+    return result, build_report(result), block
 
 
 def test_model_error_many_times_the_noise_is_reported() -> None:
@@ -134,25 +138,25 @@ def test_model_error_many_times_the_noise_is_reported() -> None:
     used = moving(block)
     plain = float(error[used].std()) / (MASS * 2e-4 * float(acc.std()))
     assert plain > 50
-    assert 0.4 * plain < report["rms_over_noise"] < plain  # other rows are noise
+    assert 0.4 * plain < report.rms_over_noise < plain  # other rows are noise
 
 
 def test_motion_errors_of_windows_have_their_noise_floor() -> None:
     result, report, block = identify(Hidden(gap=GAP))
-    (window,) = report["windows"]
+    (window,) = report.windows
     u = block.channel("rel_disp_m")
     used = block.label != Label.REST
     rms = float(np.sqrt(np.mean(u[used] ** 2)))
     noise = NOISE * float(u.std())  # of `record_block`, nearly
-    assert window["noise_floor"] == pytest.approx(noise / rms, rel=0.2)
-    assert window["noise_floor"] < window["nrmse_identified"] < window["nrmse_start"]
-    assert result.window_errors[0] == (window["nrmse_start"], window["nrmse_identified"])
+    assert window.noise_floor == pytest.approx(noise / rms, rel=0.2)
+    assert window.noise_floor < window.nrmse_identified < window.nrmse_start
+    assert result.window_errors[0] == (window.nrmse_start, window.nrmse_identified)
 
 
 def test_the_motion_errors_are_those_of_a_plain_integration() -> None:
     """Windows of a second from the measured state, with steps of a quarter of a sample."""
     result, report, block = identify(Hidden(), noise=3e-4)
-    (window,) = report["windows"]
+    (window,) = report.windows
     start = start_model().base
     fitted = result.fit.values
     for key, k, c in (
@@ -160,7 +164,7 @@ def test_the_motion_errors_are_those_of_a_plain_integration() -> None:
         ("identified", fitted[STIFFNESS], fitted[DAMPING]),
     ):
         plain = integrate_windows(block, k, c)
-        assert window[f"nrmse_{key}"] == pytest.approx(plain, rel=0.05, abs=5e-3), key
+        assert getattr(window, f"nrmse_{key}") == pytest.approx(plain, rel=0.05, abs=5e-3), key
 
 
 def integrate_windows(block: Block, k: float, c: float) -> float:

@@ -7,8 +7,8 @@ import pytest
 
 from tests.recovery.scaled_specimens import GAP, C, Hidden, K, record, start_model
 from twin.discovery.discover import Discovery, discover_effects
+from twin.discovery.model_file import format_fitted_model
 from twin.discovery.parameters import DAMPING, STIFFNESS, EffectKey, GapKey, ParameterKey
-from twin.discovery.serialize import model_to_toml
 from twin.model.config import ModelConfig
 
 HIDDEN = {
@@ -86,6 +86,6 @@ def test_a_start_of_another_size_leaves_the_verdict(force: float) -> None:
 
 def test_the_model_of_a_large_specimen_can_be_loaded() -> None:
     fit = discover("bouc_wen", 1000.0, 1.0).verdict.best.fit
-    text, _ = model_to_toml(fit, "large", "", "")
+    text, _ = format_fitted_model(fit, "large", "", "")
     (effect,) = ModelConfig.model_validate(tomllib.loads(text)).effects
     assert float(effect.parameters["force"]) > 1e5

@@ -7,8 +7,8 @@ import pytest
 from tests.discovery.played import SNM, log
 from twin.discovery.discover import prepare_problem
 from twin.discovery.least_squares import FitResult
+from twin.discovery.model_file import format_fitted_model
 from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
-from twin.discovery.serialize import model_to_toml
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +37,6 @@ def test_a_sound_sensor_of_the_table_is_not_to_be_repaired(
     parameters = fit.parameters.with_values({INPUT_GAIN: gain, INPUT_OFFSET: 1e-3})
     std_errors = {**fit.std_errors, INPUT_GAIN: std_error, INPUT_OFFSET: 1e-4}
     fitted = replace(fit, parameters=parameters, std_errors=std_errors)
-    text, notes = model_to_toml(fitted, "specimen", "", "a log", named=named)
+    text, notes = format_fitted_model(fitted, "specimen", "", "a log", named=named)
     assert "sensor" not in text
     assert [note.partition(".")[0] for note in notes] == faulty

@@ -12,8 +12,8 @@ from matplotlib.image import imread
 
 from table_io.config.base import PROFILES_DIR, parse_toml
 from tests.reports.folders import COARSE
+from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import Discovery, PreparedLog, discover_effects
-from twin.discovery.discover_command import write_results
 from twin.discovery.figure_data import (
     DiscoveryView,
     check_instruments,
@@ -21,11 +21,12 @@ from twin.discovery.figure_data import (
     measured_forces,
 )
 from twin.discovery.free_running import compute_misfits, run_log_free, run_logs_free
-from twin.discovery.headline import format_verdict
 from twin.discovery.loading import load_logs, name_logs
-from twin.discovery.page import format_with_interval
+from twin.discovery.page import format_with_interval, write_discovery_page
 from twin.discovery.parameters import GapKey
-from twin.discovery.serialize import Json, verdict_to_json
+from twin.discovery.result import EffectResult, Interval, Verdict
+from twin.discovery.task import collect_result
+from twin.discovery.words import format_verdict
 from twin.drawing.page import format_significant
 from twin.drawing.plot_style import RC_PARAMS
 from twin.laws.typesetting import typeset_law
@@ -73,7 +74,7 @@ class DiscoveryOutput:
 
     discovery: Discovery
     logs: Sequence[PreparedLog]
-    verdict_json: Json
+    verdict: Verdict
     folder: Path
 
     @property
@@ -99,9 +100,11 @@ def write_output(
     folder: Path, logs: Sequence[PreparedLog], discovery: Discovery
 ) -> DiscoveryOutput:
     folder.mkdir()
-    verdict = verdict_to_json(discovery, 1.5, ["<b>said</b>"])
-    write_results(folder, discovery, read_model_template("snm")[1], logs, verdict)
-    return DiscoveryOutput(discovery, logs, verdict, folder)
+    verdict = build_verdict(discovery, 1.5, ["<b>said</b>"])
+    result = collect_result(discovery, logs, read_model_template("snm")[1], verdict)
+    result.write(folder)
+    write_discovery_page(folder, result)
+    return DiscoveryOutput(discovery, logs, result.verdict, folder)
 
 
 @pytest.fixture(scope="module")
@@ -141,9 +144,7 @@ def output(request: pytest.FixtureRequest, every: dict[str, DiscoveryOutput]) ->
 
 
 def test_each_verdict_is_the_one_meant(every: dict[str, DiscoveryOutput]) -> None:
-    assert {word: left.verdict_json["verdict"] for word, left in every.items()} == {
-        w: w for w in VERDICTS
-    }
+    assert {word: left.verdict.verdict for word, left in every.items()} == {w: w for w in VERDICTS}
 
 
 def test_the_page_needs_nothing_else(output: DiscoveryOutput, tmp_path: Path) -> None:
@@ -156,17 +157,16 @@ def test_the_page_needs_nothing_else(output: DiscoveryOutput, tmp_path: Path) ->
 
 
 def test_the_page_says_the_verdict_the_gap_and_what_to_do(output: DiscoveryOutput) -> None:
-    page, gap = output.page, output.verdict_json["gap"]
-    assert f'<p class="verdict {output.verdict_json["verdict"]}">' in page
-    assert output.verdict_json["why"] in page.replace("&#39;", "'")
-    assert output.verdict_json["next_run"][1:] in page
-    for value in (gap["held_out_before"], gap["held_out_after"], gap["noise_floor"]):
+    page, gap = output.page, output.verdict.gap
+    assert f'<p class="verdict {output.verdict.verdict}">' in page
+    assert output.verdict.why in page.replace("&#39;", "'")
+    assert output.verdict.next_run[1:] in page
+    for value in (gap.held_out_before, gap.held_out_after, gap.noise_floor):
         assert f"{value:.3g}" in page
-    for effect in output.verdict_json["effects"]:
-        assert effect["id"] in page
-        for name, value in effect["parameters"].items():
-            numbers = [value[key] for key in ("value", "low", "high")]
-            cells = "".join(f"<td>{text}</td>" for text in format_with_interval(*numbers))
+    for effect in output.verdict.effects:
+        assert effect.id in page
+        for name, value in effect.parameters.items():
+            cells = "".join(f"<td>{text}</td>" for text in format_with_interval(value))
             assert f'<td class="text">{name}</td>{cells}' in page
 
 
@@ -175,17 +175,20 @@ def test_the_first_sentence(every: dict[str, DiscoveryOutput]) -> None:
     assert "agree to within the noise" in heads["none"]
     assert heads["named"] == "The model lacks bumper hardening."
     assert "do not determine which" in heads["ambiguous"]
-    for names in every["ambiguous"].verdict_json["ambiguous"]:
+    for names in every["ambiguous"].verdict.ambiguous:
         assert " with ".join(names) in heads["ambiguous"]
-    evidence = every["unexplained"].verdict_json["remainder"]["evidence"]
-    assert f"A general law would fit: {evidence['term']}." in heads["unexplained"].replace(
+    evidence = every["unexplained"].verdict.remainder.evidence
+    assert evidence is not None
+    assert f"A general law would fit: {evidence.term}." in heads["unexplained"].replace(
         "&#39;", "'"
     )
 
 
-def test_a_sensor_that_errs_is_not_laid_to_the_model() -> None:
-    effect = {"id": "sensor_gain", "channel": "mass_acc_m_s2"}
-    verdict = {"verdict": "named", "effects": [effect], "ambiguous": []}
+def test_a_sensor_that_errs_is_not_laid_to_the_model(
+    every: dict[str, DiscoveryOutput],
+) -> None:
+    effect = EffectResult(id="sensor_gain", channel="mass_acc_m_s2", confidence=0.9, parameters={})
+    verdict = every["named"].verdict.model_copy(update={"effects": [effect]})
     sentence = format_verdict(verdict)
     assert "sensor gain error of mass_acc_m_s2" in sentence
     assert "model lacks" not in sentence
@@ -306,13 +309,13 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Discovery
     runs = run_logs_free(shown)
     (row,) = compute_misfits(shown, runs)
     measured = max(p.measured.eta_d for p in runs[0][0].points if p.measured is not None)
-    assert row["measured"]["eta_d"] == measured
-    given, refitted, final = row["models"]
-    assert final["error"] < 0.25 * refitted["error"]
-    for model in row["models"]:
-        assert f"<b>{format_significant(100 * model['error'])} %</b>" in output.page
-    assert given["error"] > final["error"]
-    assert final["jumps"] == row["measured"]["jumps"]
+    assert row.measured.eta_d == measured
+    given, refitted, final = row.models
+    assert final.error < 0.25 * refitted.error
+    for model in row.models:
+        assert f"<b>{format_significant(100 * model.error)} %</b>" in output.page
+    assert given.error > final.error
+    assert final.jumps == row.measured.jumps
     same = replace(
         output.discovery.selection, null=output.discovery.verdict.best
     )  # nothing before but what is after
@@ -320,33 +323,36 @@ def test_the_table_of_the_curves_says_how_much_nearer(every: dict[str, Discovery
         again := DiscoveryView(replace(output.discovery, selection=same), output.logs),
         run_logs_free(again),
     )
-    _, refitted, final = row["models"]
-    assert refitted == final | {"label": refitted["label"]}
+    _, refitted, final = row.models
+    assert refitted == replace(final, label=refitted.label)
 
 
 def test_the_staircase_falls_from_the_model_as_given_to_the_noise(
     every: dict[str, DiscoveryOutput],
 ) -> None:
     output = every["named"]
-    stairs, gap = output.verdict_json["staircase"], output.verdict_json["gap"]
-    sizes = [step["misfit"] for step in stairs]
+    stairs, gap = output.verdict.staircase, output.verdict.gap
+    sizes = [step.misfit for step in stairs]
     assert len(sizes) == 4
     assert sizes == sorted(sizes, reverse=True)
     assert sizes == [
-        gap[key] for key in ("given", "held_out_before", "held_out_after", "noise_floor")
+        gap.given,
+        gap.held_out_before,
+        gap.held_out_after,
+        gap.noise_floor,
     ]
-    assert "bumper_hardening" in stairs[2]["label"]
-    general = every["unexplained"].verdict_json["staircase"][-2]
-    assert "general law" in general["label"]
-    assert general["misfit"] < sizes[1]
+    assert "bumper_hardening" in stairs[2].label
+    general = every["unexplained"].verdict.staircase[-2]
+    assert "general law" in general.label
+    assert general.misfit < sizes[1]
 
 
 def test_rivals_are_excluded_by_their_standard_errors(every: dict[str, DiscoveryOutput]) -> None:
-    rivals = every["named"].verdict_json["excluded"]
+    rivals = every["named"].verdict.excluded
     assert rivals
-    assert all(rival["sigma"] > 3 for rival in rivals)
-    assert "bumper_hardening" not in {rival["id"] for rival in rivals}
-    assert every["none"].verdict_json["excluded"] == []
+    assert all(rival.sigma > 3 for rival in rivals)
+    assert "bumper_hardening" not in {rival.id for rival in rivals}
+    assert every["none"].verdict.excluded == []
 
 
 def test_only_a_model_that_is_not_sure_is_provisional(every: dict[str, DiscoveryOutput]) -> None:
@@ -385,7 +391,8 @@ def test_laws_are_typeset(term: str, typeset: str) -> None:
 def test_an_interval_can_be_told_from_its_value(
     value: float, half: float, texts: list[str]
 ) -> None:
-    assert format_with_interval(value, value - half, value + half) == texts
+    interval = Interval(value=value, low=value - half, high=value + half, unit="")
+    assert format_with_interval(interval) == texts
 
 
 def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(

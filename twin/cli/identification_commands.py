@@ -89,23 +89,19 @@ def discover_missing_effect(
 ) -> None:
     """Find the physical effect the model is missing and refit with it."""
     if features is not None:
-        from twin.discovery.features_command import discover_by_features, require_no_logs
+        from twin.discovery.command import require_no_logs, run_feature_search
 
         require_no_logs(logs or [], held_out or [])
-        raise typer.Exit(discover_by_features(features, model, out, without or []))
+        raise typer.Exit(run_feature_search(features, model, out, without or []))
     if not logs:
         raise typer.BadParameter("give one LOG or more, or --features FILE", param_hint="LOG...")
-    from twin.discovery import decide_command as decisive
+    from twin.discovery.command import parse_options, run_decision, run_discovery
 
-    options = decisive.parse_options(decide, run, rig, budget_min, yes, speed)
+    options = parse_options(decide, run, rig, budget_min, yes, speed)
     if run and options is not None:
-        code = decisive.play_decisive_tests(
-            logs, model, out, without or [], held_out or [], options
-        )
-        raise typer.Exit(code)
-    from twin.discovery.discover_command import judge_logs
-
-    raise typer.Exit(judge_logs(logs, model, out, without or [], held_out or [], options).code)
+        raise typer.Exit(run_decision(logs, model, out, without or [], held_out or [], options))
+    _, code = run_discovery(logs, model, out, without or [], held_out or [], options)
+    raise typer.Exit(code)
 
 
 @identification_app.command("identify", rich_help_panel=LEARN_PANEL)
@@ -120,9 +116,9 @@ def identify_from_logs(
     ] = None,
 ) -> None:
     """Identify parameters and gaps, with uncertainty, from recordings; write a model file."""
-    from twin.discovery.identify_command import identify_command as command
+    from twin.discovery.command import run_identification
 
-    raise typer.Exit(command(logs, model, out))
+    raise typer.Exit(run_identification(logs, model, out))
 
 
 @identification_app.command("table-twin", rich_help_panel=LEARN_PANEL)

@@ -5,6 +5,7 @@ The effect is sealed: only the simulated table reads its file, and the seal is o
 
 import hashlib
 import json
+import math
 import random
 import secrets
 from dataclasses import dataclass, field
@@ -22,7 +23,8 @@ from table_io.sim.ground_truth import (
     HiddenEffect,
     parse_ground_truth,
 )
-from twin.discovery.discover_command import judge_logs
+from twin.discovery.command import run_discovery
+from twin.discovery.result import Verdict
 from twin.drawing.page import embed_images, render_page
 from twin.drawing.plot_style import (
     CaptionedFigure,
@@ -115,10 +117,10 @@ def run_demo(out: Path | None, seed: int | None, keep: Path | None, show_page: b
     story.add_line(f"Twin error: {before}.")
 
     story.begin_chapter("Discover what the model lacks, from the recording")
-    code = judge_logs([folder / FIRST_RUN], "snm", folder / DISCOVERY).code
-    if code:
+    discovered, code = run_discovery([folder / FIRST_RUN], "snm", folder / DISCOVERY)
+    if code or discovered is None:
         return code
-    verdict = json.loads((folder / DISCOVERY / "verdict.json").read_text(encoding="utf-8"))
+    verdict = discovered.verdict
     story.add_line(_describe_verdict(verdict))
 
     story.begin_chapter("Add it to the model and run again, with new noise")
@@ -199,9 +201,9 @@ def read_twin_error(run: Path) -> TwinError:
     return TwinError(entry["nrmse"], entry["noise_floor"], summary)
 
 
-def _describe_verdict(verdict: dict[str, Any]) -> str:
-    names = [f"{effect['id']}, {find_effect(effect['id']).term}" for effect in verdict["effects"]]
-    return f"Verdict: {verdict['verdict']}{': ' if names else ''}{' + '.join(names)}."
+def _describe_verdict(verdict: Verdict) -> str:
+    names = [f"{effect.id}, {find_effect(effect.id).term}" for effect in verdict.effects]
+    return f"Verdict: {verdict.verdict}{': ' if names else ''}{' + '.join(names)}."
 
 
 def open_seal(folder: Path, digest: str) -> GroundTruth:
@@ -210,10 +212,10 @@ def open_seal(folder: Path, digest: str) -> GroundTruth:
     return parse_ground_truth(path.read_bytes(), digest, str(path))
 
 
-def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str]:
+def compare_with_seal(hidden: HiddenEffect, verdict: Verdict) -> list[str]:
     """Return a line whether the hidden effect was named, and one per parameter and false name."""
-    parameters_by_id = {effect["id"]: effect["parameters"] for effect in verdict["effects"]}
-    is_named = verdict["verdict"] == "named" and hidden.id in parameters_by_id
+    parameters_by_id = {effect.id: effect.parameters for effect in verdict.effects}
+    is_named = verdict.verdict == "named" and hidden.id in parameters_by_id
     if not is_named:
         lines = [f"It was {hidden.id}, which discovery did not name this time."]
     else:
@@ -222,15 +224,13 @@ def compare_with_seal(hidden: HiddenEffect, verdict: dict[str, Any]) -> list[str
             "own, so parameters may differ by a few per cent."
         ]
         for name, fit in parameters_by_id[hidden.id].items():
-            half = 0.5 * (fit["high"] - fit["low"])
+            half = math.inf if fit.half_width is None else fit.half_width
             truth = hidden.parameters.get(name)
             known = "" if truth is None else f"hidden {truth:.4g}, "
-            lines.append(
-                f"{name}: {known}found {fit['value']:.4g} +- {half:.1g} {fit['unit']}".rstrip()
-            )
+            lines.append(f"{name}: {known}found {fit.value:.4g} +- {half:.1g} {fit.unit}".rstrip())
     false_names = [name for name in parameters_by_id if name != hidden.id]
     if false_names:
-        word = "found" if verdict["verdict"] == "named" else "proposed"
+        word = "found" if verdict.verdict == "named" else "proposed"
         lines.append(f"Not hidden, but {word}: {', '.join(false_names)}.")
     return lines
 

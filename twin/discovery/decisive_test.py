@@ -10,17 +10,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from table_io.block import Block
+from table_io.block import Block, Label
 from table_io.config.base import parse_toml
 from table_io.config.excitation import MIN_BLEND_CYCLES
+from table_io.config.folders import find_config
 from table_io.config.profile import Profile
+from table_io.config.rig_file import load_rig
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
-from table_io.records import RunStart
+from table_io.records import RunStart, Step
 from table_io.safety.preflight import CORRECTION_HEADROOM, check_limits
 from table_io.units import GRAVITY_M_S2
 from twin.discovery.discover import Discovery
@@ -30,10 +33,22 @@ from twin.discovery.experiment_design import (
     list_rivals,
     rank_tests,
 )
-from twin.discovery.selection import FittedSet
+from twin.discovery.law_search import LawProposal
+from twin.discovery.result import (
+    DecisiveTest,
+    ExpectedPeak,
+    OtherTest,
+    RivalPrediction,
+    Verdict,
+)
+from twin.discovery.selection import FittedSet, ProgressCallback, SelectionProgress
+from twin.results.recordings import open_recording
 from twin.setup.run_config import RunConfig, from_texts
 
 Table = dict[str, Any]
+BUDGET_MIN = 10.0  # of rig time, by default
+PROFILE_FILE = "decide.toml"  # of the proposed test, next to the verdict
+MAX_OTHER_TESTS = 4  # listed after the proposed one
 TEST_S = 75.0  # intended duration: a recording that discovery judges in seconds
 LEVEL_RATIOS = (1.0, 0.5, 2.0, 4.0)  # to the level of the recorded test
 BAND_RATIO = 2.0  # by which the band is extended to either side
@@ -46,6 +61,34 @@ MAX_DRAWS = 1000  # of a random test
 MIN_PROBABILITY = 0.05  # of a decision, below which a test is not worth its time
 # Tables of a recorded test that are about that run alone.
 OWN_TABLES = ("sweep", "excitation", "dwell", "track", "refine", "resume", "set_up", "tracking")
+
+
+@dataclass(frozen=True)
+class DecideOptions:
+    """Options of `--decide`: file of the proposed profile, rig, rig time, who is asked, speed.
+
+    Without `profile` it is written next to the verdict.
+    """
+
+    profile: Path | None = None
+    rig: str = ""
+    budget_min: float = BUDGET_MIN
+    asks: bool = True
+    unpaced: bool = False
+
+    def check(self) -> None:
+        """Raise InputError if the profile exists or the budget is no time."""
+        if self.profile is not None and self.profile.exists():
+            raise InputError(
+                "exists; nothing is overwritten",
+                key="--decide",
+                value=str(self.profile),
+                remedy="give a new file",
+            )
+        if not self.budget_min > 0:
+            raise InputError(
+                "no rig time", key="--budget-min", value=self.budget_min, allowed="above 0 min"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +147,10 @@ class TestProposal:
         return f"decides between {' and '.join(names)}"
 
     def format_profile(self, rig: str, extra: Mapping[str, Table] | None = None) -> str:
-        """Return the text of its profile, which states what it is for and what is expected."""
+        """Return the text of its profile, which states what it is for and what is expected.
+
+        Without `rig` it is that of the recorded test.
+        """
         content = tomllib.loads(self.test.config.profile_toml)
         expected = (
             f"Proposed by `shaketwin discover --decide`, which compared {self.count} tests. "
@@ -112,10 +158,138 @@ class TestProposal:
             f"errors, a decision with probability {self.prediction.probability:.2f}."
         )
         title = f"{self.test.title}: {self.purpose}"
-        head = {"title": title, "notes": expected, "rig": rig}
+        head = {
+            "title": title,
+            "notes": expected,
+            "rig": rig or self.test.config.profile.rig,
+        }
         return format_toml(
             head | {k: v for k, v in content.items() if k not in head} | dict(extra or {})
         )
+
+
+def propose_decisive_test(
+    verdict: Verdict,
+    discovery: Discovery,
+    law: LawProposal | None,
+    recorded: RunStart,
+    rig_toml: str,
+    options: DecideOptions,
+    report: ProgressCallback,
+) -> tuple[Verdict, tuple[TestProposal, ...]]:
+    """Return (verdict with the test that would decide best, all proposals, the best first)."""
+
+    def show(title: str) -> None:
+        stage = f"simulating candidate tests: {title}"
+        report(SelectionProgress(stage, best=discovery.verdict.best))
+
+    tests = list_candidate_tests(recorded, rig_toml, options.budget_min, options.asks)
+    proposals = propose_tests(discovery, tests, show, law.fitted if law else None)
+    if not proposals:
+        next_run = (
+            f"of {len(tests)} tests that the rig can play, none separates with every sensor within "
+            "its range"
+        )
+        return verdict.model_copy(update={"decide": None, "next_run": next_run}), ()
+    name = options.profile.name if options.profile else PROFILE_FILE
+    decisive = _build_decisive_test(proposals, name)
+    next_run = _describe_next_run(decisive)
+    return (
+        verdict.model_copy(update={"decide": decisive, "next_run": next_run}),
+        tuple(proposals),
+    )
+
+
+def _build_decisive_test(proposals: Sequence[TestProposal], profile: str) -> DecisiveTest:
+    """Return the block `decide` of verdict.json; `profile` is the file of the best test."""
+    proposal, *others = proposals
+    prediction, test = proposal.prediction, proposal.test
+    return DecisiveTest(
+        title=test.title,
+        purpose=proposal.purpose,
+        profile=profile,
+        set_up=test.set_up,
+        confirmation=prediction.is_confirmation,
+        minutes=test.minutes,
+        sigma=prediction.sigma,
+        probability=prediction.probability,
+        separation_per_min=prediction.separation_per_minute,
+        count=proposal.count,
+        rivals=[
+            _build_rival(prediction, index, test.config.steps)
+            for index in range(len(prediction.rivals))
+        ],
+        others=[
+            OtherTest(
+                title=other.test.title,
+                minutes=other.test.minutes,
+                sigma=other.prediction.sigma,
+                probability=other.prediction.probability,
+            )
+            for other in others[:MAX_OTHER_TESTS]
+        ],
+    )
+
+
+def _describe_next_run(decide: DecisiveTest) -> str:
+    """Return the sentence on the proposed test that stands for the general suggestion."""
+    set_up = f", {decide.set_up}" if decide.set_up else ""
+    return (
+        f"{decide.title}{set_up} ({decide.profile}, {decide.minutes:.2g} min): "
+        f"{decide.purpose}; {decide.sigma:.2g} standard errors are expected, with a "
+        f"probability of {100 * decide.probability:.0f} %"
+        f"{' for each' if decide.confirmation else ' for a decision'}"
+    )
+
+
+def _build_rival(prediction: TestPrediction, index: int, steps: Sequence[Step]) -> RivalPrediction:
+    """Return a rival with its expected separation and peaks."""
+    as_true = [pair.sigma for pair in prediction.pairs if pair.truth == index]
+    as_other = [pair.misfit for pair in prediction.pairs if pair.other == index]
+    simulated = prediction.simulated.get(index)
+    return RivalPrediction(
+        id=prediction.rivals[index].name,
+        misfit=max(as_other, default=None),
+        sigma=min(as_true, default=None),
+        peaks=_list_peaks(simulated, steps) if simulated is not None else [],
+    )
+
+
+def _list_peaks(block: Block, steps: Sequence[Step]) -> list[ExpectedPeak]:
+    """Return the largest displacement of the mass against the table in each step or window."""
+    if "rel_disp_m" in block.channels:
+        disp = block.channel("rel_disp_m")
+    else:
+        disp = block.channel("mass_disp_m") - block.channel("table_disp_m")
+    measured = block.label == Label.MEASURE
+    by_index = {step.index: step for step in steps}
+    return [
+        ExpectedPeak(
+            frequency_hz=by_index[number].frequency_hz if number in by_index else None,
+            direction=by_index[number].direction if number in by_index else f"window {number}",
+            peak_disp_m=float(np.abs(disp[measured & (block.step == number)]).max()),
+        )
+        for number in np.unique(block.step[measured]).tolist()
+        if number >= 0
+    ]
+
+
+def read_recorded_test(paths: Sequence[Path], options: DecideOptions) -> tuple[RunStart, str]:
+    """Return the last recorded test and the text of the rig; InputError if either is unknown."""
+    recorded = open_recording(paths[-1]).start
+    rig_toml = load_named_rig(options.rig) if options.rig else recorded.rig_toml
+    if not recorded.profile_toml or not rig_toml:
+        raise InputError(
+            "no test can be proposed: its profile and rig are not in the recording",
+            where=paths[-1],
+            remedy="import it with --profile, or omit --decide",
+        )
+    return recorded, rig_toml
+
+
+def load_named_rig(rig: str) -> str:
+    """Return the text of a rig file by its name or path."""
+    return load_rig(find_config(rig, "rigs", option="--rig"))[1]
 
 
 def propose_tests(

@@ -288,10 +288,7 @@ def _move_along(fitted: FittedSet, index: int, sigma: float) -> FittedSet:
     """
     fit = fitted.fit
     values = dict(fit.parameters.values)
-    # the intervals may be wider than the covariance says: its diagonal is then below 1
-    widening = np.sqrt(np.maximum(np.diag(fit.correlation), 1e-12))
-    correlation = fit.correlation[index] / widening / widening[index]
-    correlation[index] = 1.0
+    correlation = fit.correlation[index]
     for other, free in enumerate(fit.free):
         shift = sigma * correlation[other] * fit.std_errors[free.key]
         value = fit.values[free.key]

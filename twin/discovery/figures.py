@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
 from table_io.records import Step
-from twin.discovery.decisive_section import draw_prediction
+from twin.discovery.build_verdict import noise_factor
 from twin.discovery.figure_data import DiscoveryView, is_periodic, list_phases
 from twin.discovery.force_figures import (
     GENERIC_COLOUR,
@@ -28,8 +28,8 @@ from twin.discovery.free_running import FreeRuns
 from twin.discovery.localization import ResidualCell
 from twin.discovery.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
+from twin.discovery.result import CandidateResult, DecisiveTest, Verdict
 from twin.discovery.selection import MIN_GAP_SHARE
-from twin.discovery.serialize import Json, noise_factor
 from twin.discovery.twin_figures import draw_free_running
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
@@ -43,6 +43,7 @@ from twin.drawing.plot_style import (
 )
 
 MAX_LOGS, MAX_BARS, MAX_TICKS = 6, 24, 24
+RIVAL_STYLES = (("#1559b0", "o-"), ("#cf222e", "s--"), ("#1a7f37", "^:"), ("#9a6700", "v-."))
 MIN_INSIDE_SHARE = 0.3  # of the longest bar: longer bars carry their note inside
 MIN_EXCESS = 0.1  # lower end of the color scale, relative to the noise
 MIN_TOP_EXCESS = 10.0  # smallest upper end of the color scale, so that noise stays pale
@@ -55,7 +56,7 @@ BEFORE_COLOUR, AFTER_COLOUR, BEST_COLOUR = "#8b929c", "#1a7f37", "#1a7f37"
 
 
 def draw_discovery_figures(
-    view: DiscoveryView, verdict: Json, runs: dict[int, FreeRuns], folder: Path
+    view: DiscoveryView, verdict: Verdict, runs: dict[int, FreeRuns], folder: Path
 ) -> dict[str, list[Picture]]:
     """Draw all figures as PNG files in `folder`; return them by section of the page."""
     return {
@@ -67,21 +68,21 @@ def draw_discovery_figures(
             "histories": draw_force_histories(view),
             "twin": draw_free_running(view, runs, select_logs(view)),
             "time": _draw_time(view),
-            "decide": draw_prediction(verdict.get("decide")),
+            "decide": _draw_prediction(verdict.decide),
         }.items()
     }  # fmt: skip
 
 
-def _draw_staircase(verdict: Json) -> CaptionedFigures:
+def _draw_staircase(verdict: Verdict) -> CaptionedFigures:
     """Draw the misfit falling step by step, from the model as given to the noise floor."""
-    steps = verdict["staircase"]
-    sizes = [step["misfit"] for step in steps]
+    steps = verdict.staircase
+    sizes = [step.misfit for step in steps]
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.3))
     ax = figure.subplots()
     floor = sizes[-1]
     bottom = 0.5 * min(sizes)
     for number, (step, size) in enumerate(zip(steps[:-1], sizes, strict=False)):
-        is_generic = "general law" in step["label"]
+        is_generic = "general law" in step.label
         colour = (GIVEN_COLOUR, BEFORE_COLOUR, GENERIC_COLOUR if is_generic else BEST_COLOUR)[
             min(number, 2)
         ]
@@ -102,7 +103,7 @@ def _draw_staircase(verdict: Json) -> CaptionedFigures:
     ax.set_xlim(-0.6, len(sizes) - 0.9)
     ax.yaxis.set_major_formatter("{x:g}")
     ax.yaxis.set_minor_formatter("")
-    labels = [step["label"].replace("_", " ").replace(" + ", "\n+ ") for step in steps[:-1]]
+    labels = [step.label.replace("_", " ").replace(" + ", "\n+ ") for step in steps[:-1]]
     ax.set_xticks(range(len(labels)), labels)
     ax.grid(visible=False, axis="x")
     ax.set_ylabel("misfit, multiples of the noise")
@@ -227,47 +228,47 @@ def _label_map_steps(ax: Axes, steps: Sequence[Step]) -> None:
     ax.set_xlabel("step, frequency in Hz")
 
 
-def _draw_candidates(verdict: Json) -> CaptionedFigures:
+def _draw_candidates(verdict: Verdict) -> CaptionedFigures:
     """Draw the held-out error of every fitted set, best first."""
-    candidates = verdict["candidates"]
-    null = next(candidate for candidate in candidates if candidate["id"] == "nothing added")
+    candidates = verdict.candidates
+    null = next(candidate for candidate in candidates if candidate.id == "nothing added")
     sets = candidates[:MAX_BARS]
     if null not in sets:
         sets = [*sets[:-1], null]
-    added_ids = {".".join(filter(None, (e["id"], e.get("channel")))) for e in verdict["effects"]}
-    floor, best = verdict["gap"]["noise_floor"], sets[0]["held_out_error"]
+    added_ids = {effect.name for effect in verdict.effects}
+    floor, best = verdict.gap.noise_floor, sets[0].held_out_error
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.23 * len(sets) + 1.2))
     ax = figure.subplots()
-    is_log_scale = sets[-1]["held_out_error"] > 8 * min(best, floor)
+    is_log_scale = sets[-1].held_out_error > 8 * min(best, floor)
     for y, candidate in enumerate(sets):
         ax.barh(
             y,
-            candidate["held_out_error"],
+            candidate.held_out_error,
             color=_bar_colour(candidate, null, added_ids),
             height=0.68,
         )
         inside = (
             bool(_format_doubts(candidate))
-            and candidate["held_out_error"] > MIN_INSIDE_SHARE * sets[-1]["held_out_error"]
+            and candidate.held_out_error > MIN_INSIDE_SHARE * sets[-1].held_out_error
         )
         ax.annotate(
-            f"{candidate['held_out_error']:.3g}{_format_doubts(candidate)}",
-            (candidate["held_out_error"], y),
+            f"{candidate.held_out_error:.3g}{_format_doubts(candidate)}",
+            (candidate.held_out_error, y),
             (-4 if inside else 4, 0), textcoords="offset points", va="center", size=7.5,
             ha="right" if inside else "left", color=TWIN_COLOUR if inside else GUIDE_COLOUR,
         )  # fmt: skip
     ax.set_yticks(
         range(len(sets)),
-        [candidate["id"].replace(f"{GENERIC_PREFIX}.", "") for candidate in sets],
+        [candidate.id.replace(f"{GENERIC_PREFIX}.", "") for candidate in sets],
         size=8,
     )
     ax.set_ylim(len(sets) - 0.4, -0.6)
     if is_log_scale:
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter("{x:g}")
-        ax.set_xlim(0.7 * min(best, floor), 2 * sets[-1]["held_out_error"])
+        ax.set_xlim(0.7 * min(best, floor), 2 * sets[-1].held_out_error)
     else:
-        ax.set_xlim(0, 1.15 * max(sets[-1]["held_out_error"], floor))
+        ax.set_xlim(0, 1.15 * max(sets[-1].held_out_error, floor))
     ax.axvline(floor, color=TWIN_COLOUR, ls="--", lw=1)
     ax.grid(visible=False, axis="y")
     ax.set_xlabel("rms of measured minus model over the noise, held out")
@@ -288,10 +289,10 @@ def _draw_candidates(verdict: Json) -> CaptionedFigures:
     yield CaptionedFigure("candidates", "Candidate effects", caption, figure)
 
 
-def _format_doubts(candidate: Json) -> str:
+def _format_doubts(candidate: CandidateResult) -> str:
     """Return remarks on a fit: not converged, parameters at a bound (tare errors do not count)."""
-    at_bound = [name for name in candidate.get("at_bound", ()) if not name.startswith(TARE_PREFIX)]
-    text = "" if candidate["converged"] else ", not converged"
+    at_bound = [name for name in candidate.at_bound if not name.startswith(TARE_PREFIX)]
+    text = "" if candidate.converged else ", not converged"
     return (
         f"{text}, {at_bound[0].removeprefix(f'{GENERIC_PREFIX}.')} at its bound"
         if at_bound
@@ -299,12 +300,12 @@ def _format_doubts(candidate: Json) -> str:
     )
 
 
-def _bar_colour(candidate: Json, null: Json, added_ids: set[str]) -> str:
+def _bar_colour(candidate: CandidateResult, null: CandidateResult, added_ids: set[str]) -> str:
     if candidate is null:
         return BEFORE_COLOUR
-    if GENERIC_PREFIX in candidate["id"]:
+    if GENERIC_PREFIX in candidate.id:
         return GENERIC_COLOUR
-    return BEST_COLOUR if set(candidate["id"].split(" + ")) == added_ids else "#9db7d5"
+    return BEST_COLOUR if set(candidate.id.split(" + ")) == added_ids else "#9db7d5"
 
 
 def _draw_time(view: DiscoveryView) -> CaptionedFigures:
@@ -359,3 +360,30 @@ def _block_means(
     )
     squares = (residuals.weight * held_out[in_rows]) ** 2
     return t, np.bincount(blocks, weights=squares) / count
+
+
+def _draw_prediction(decide: DecisiveTest | None) -> CaptionedFigures:
+    """Draw the peaks that each rival predicts for the proposed test."""
+    rivals = [rival for rival in decide.rivals if rival.peaks] if decide else []
+    if decide is None or not rivals:
+        return
+    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.2))
+    ax = figure.subplots()
+    for (colour, style), rival in zip(RIVAL_STYLES, rivals, strict=False):
+        peaks = [1e3 * peak.peak_disp_m for peak in rival.peaks]
+        ax.plot(np.arange(len(peaks)), peaks, style, color=colour, label=rival.id, ms=4)
+    ticks = [
+        f"{peak.frequency_hz:g} Hz" if peak.frequency_hz else peak.direction
+        for peak in rivals[0].peaks
+    ]
+    ax.set_xticks(np.arange(len(ticks)), ticks, rotation=60)
+    ax.set_xlabel("steps or windows, in the order in which they are played")
+    ax.set_ylabel("largest |u|, mm")
+    ax.set_ylim(bottom=0)
+    ax.legend()
+    caption = (
+        "Displacement of the mass against the table if each explanation is true, with the "
+        "parameters of its fit. The separation is not this difference, which other parameters may "
+        "absorb, but what remains of it in the forces after each is fitted again."
+    )
+    yield CaptionedFigure("decide", f"Expected in: {decide.title}", caption, figure)

@@ -9,14 +9,13 @@ import numpy as np
 from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.records import PrcPoint, Step
-from twin.compare.curves import detect_hysteresis
+from twin.compare.curves import PrcJump, detect_hysteresis
 from twin.compare.cycles import PrcScale
 from twin.compare.pipeline import PipelineSetup, start_pipeline, step
 from twin.compare.twins import TwinSetup
 from twin.discovery.figure_data import DiscoveryView
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import FittedSet
-from twin.discovery.serialize import Json
 from twin.model.parameters import free_flight_resonance
 
 WINDOW_S = 0.5
@@ -35,6 +34,36 @@ class FreeRun:
 FreeRuns = tuple[FreeRun, ...]  # one per model of MODELS
 
 
+@dataclass(frozen=True)
+class CurvePeak:
+    """Peak of eta_d of a curve, its frequency in Hz, and the jumps of the curve."""
+
+    eta_d: float
+    frequency_hz: float
+    jumps: list[PrcJump]
+
+
+@dataclass(frozen=True)
+class ModelledCurve(CurvePeak):
+    """Peak and jumps of a model, and its misfit.
+
+    `error` is the rms of model minus measured eta_d over the rms of the measured curve, for both
+    directions.
+    """
+
+    label: str
+    error: float
+
+
+@dataclass(frozen=True)
+class CurveMisfit:
+    """Measured curve of a log, and that of each model."""
+
+    log: str
+    measured: CurvePeak
+    models: list[ModelledCurve]
+
+
 def run_logs_free(view: DiscoveryView) -> dict[int, FreeRuns]:
     """Return the free runs by log number; logs that cannot be run free are omitted."""
     runs: dict[int, FreeRuns] = {}
@@ -46,39 +75,37 @@ def run_logs_free(view: DiscoveryView) -> dict[int, FreeRuns]:
     return runs
 
 
-def compute_misfits(view: DiscoveryView, runs: dict[int, FreeRuns]) -> list[Json]:
-    """Return per log the peak of eta_d, its frequency in Hz and the jumps, measured and modelled.
-
-    `error` is the rms of model minus measured eta_d over the rms of the measured curve, for both
-    directions.
-    """
+def compute_misfits(view: DiscoveryView, runs: dict[int, FreeRuns]) -> list[CurveMisfit]:
+    """Return peak and jumps of eta_d of each log, measured and modelled, with the misfits."""
     return [
-        {
-            "log": view.log_residuals[number].signals.name,
-            "measured": _find_peak(of_models[0].points, "measured")
-            | {"jumps": detect_hysteresis(of_models[0].points, "measured")[0]},
-            "models": [
-                _find_peak(run.points, "twin")
-                | {
-                    "label": label,
-                    "error": _relative_error(run.points),
-                    "jumps": detect_hysteresis(run.points, "twin")[0],
-                }
+        CurveMisfit(
+            log=view.log_residuals[number].signals.name,
+            measured=CurvePeak(
+                *_find_peak(of_models[0].points, "measured"),
+                detect_hysteresis(of_models[0].points, "measured")[0],
+            ),
+            models=[
+                ModelledCurve(
+                    *_find_peak(run.points, "twin"),
+                    detect_hysteresis(run.points, "twin")[0],
+                    label,
+                    _relative_error(run.points),
+                )
                 for label, run in zip(MODELS, of_models, strict=True)
             ],
-        }
+        )
         for number, of_models in runs.items()
     ]
 
 
-def _find_peak(points: Sequence[PrcPoint], source: str) -> Json:
+def _find_peak(points: Sequence[PrcPoint], source: str) -> tuple[float, float]:
+    """Return (largest eta_d, its frequency in Hz)."""
     peaks = [
         (values.eta_d, point.frequency_hz)
         for point in points
         if (values := getattr(point, source)) is not None and math.isfinite(values.eta_d)
     ]
-    peak, hz = max(peaks, default=(math.nan, math.nan))
-    return {"eta_d": peak, "frequency_hz": hz}
+    return max(peaks, default=(math.nan, math.nan))
 
 
 def _relative_error(points: Sequence[PrcPoint]) -> float:

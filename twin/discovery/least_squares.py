@@ -269,8 +269,8 @@ class _LevenbergMarquardt:
         block_counts = _count_effective_blocks(information, np.diag(hessian))
         unit_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
         white_sd = unit_sd * math.sqrt(max(cost / max(self.count, 1), 1.0))
+        divisor = np.where(sd > 0, sd, 1.0)  # before they are widened, which correlates nothing
         sd = _widen_for_few_blocks(sd, white_sd, block_counts)
-        divisor = np.where(sd > 0, sd, 1.0)
         values, std_errors, white_errors, at_bound = {}, {}, {}, []
         for i, free in enumerate(self.free):
             key = free.key
@@ -281,6 +281,7 @@ class _LevenbergMarquardt:
             if x[i] in (self.low[i], self.high[i]):
                 at_bound.append(key)
         correlation = covariance / np.outer(divisor, divisor)
+        np.fill_diagonal(correlation, 1.0)
         return FitResult(
             parameters, values, std_errors, correlation, cost / max(self.count, 1),
             converged,

@@ -1,37 +1,39 @@
-"""HTML report of a discovery: the discrepancy, the effects found, and the misfit of each model.
+"""HTML pages of a discovery and of an identification: each one self-contained file.
 
-The numbers are those of verdict.json; the file is self-contained.
+The numbers are those of verdict.json and identify.json.
 """
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from twin.discovery.discover import Discovery, PreparedLog
+from twin.discovery.discover import PreparedLog
 from twin.discovery.figure_data import DiscoveryView, check_instruments
 from twin.discovery.figures import draw_discovery_figures
 from twin.discovery.free_running import compute_misfits, run_logs_free
-from twin.discovery.headline import (
+from twin.discovery.identify_figures import draw_identification_figures
+from twin.discovery.parameters import GAP_PREFIX
+from twin.discovery.result import Interval, Verdict
+from twin.discovery.screening import MIN_STEP_UNITS
+from twin.discovery.task import DiscoveredModel, FittedModel
+from twin.discovery.words import (
+    CHANNEL_KINDS,
+    KIND_LABELS,
     describe_excluded,
     describe_laws,
+    describe_sensors,
     format_effect,
     format_interval,
     format_verdict,
-    typeset_proposal,
-)
-from twin.discovery.law_search import LawProposal
-from twin.discovery.parameters import GAP_PREFIX
-from twin.discovery.screening import MIN_STEP_UNITS
-from twin.discovery.sensor_section import (
-    CHANNEL_KINDS,
-    KIND_LABELS,
     tabulate_channels,
     tabulate_comparisons,
+    typeset_proposal,
 )
-from twin.discovery.serialize import Json
 from twin.drawing.page import MAX_PLAIN, embed_images, format_significant, render_page
+from twin.results.quantities import format_quantity
 
 DIGITS, MAX_DECIMALS = 4, 9  # of a fitted value
 SECTIONS = {
@@ -41,77 +43,70 @@ SECTIONS = {
 }  # fmt: skip
 
 
-def write_discovery_page(
-    folder: Path,
-    discovery: Discovery,
-    logs: Sequence[PreparedLog],
-    verdict: Json,
-    proposal: LawProposal | None = None,
-) -> Path:
+def write_discovery_page(folder: Path, result: DiscoveredModel) -> Path:
     """Write folder/report.html and its figures to folder/figures; return the path of the page."""
-    view = DiscoveryView(discovery, logs, proposal)
+    verdict, logs = result.verdict, result.logs
+    view = DiscoveryView(result.discovery, logs, result.law)
     runs = run_logs_free(view)
     pictures = draw_discovery_figures(view, verdict, runs, folder / "figures")
     text = render_page(
         Path(__file__).with_name("page.html"),
         verdict=verdict,
         sentence=format_verdict(verdict),
-        laws=[] if verdict["law"] else describe_laws(verdict),
+        laws=[] if verdict.law else describe_laws(verdict),
         excluded=describe_excluded(verdict),
-        proposed=verdict["law"],
-        proposed_terms=typeset_proposal(verdict["law"]),
+        proposed=verdict.law,
+        proposed_terms=typeset_proposal(verdict.law) if verdict.law else [],
         quantity=format_interval,
         held_out=describe_held_out(view),
         rows=list_parameter_rows(verdict, [log.signals.name for log in logs]),
         logs=[_log_facts(log) for log in logs],
         sections=order_sections(verdict),
-        complete=discovery.selection.complete,
+        complete=result.is_complete,
         gates=check_instruments(view),
-        sensor_rows=tabulate_channels(verdict["sensors"]),
+        sensor_rows=tabulate_channels(verdict.sensors),
         channel_columns=("channel", *(KIND_LABELS[kind] for kind in CHANNEL_KINDS)),
-        comparison_rows=tabulate_comparisons(verdict["sensors"]),
+        comparison_rows=tabulate_comparisons(verdict.sensors),
         misfits=compute_misfits(view, runs),
         images={
             section: embed_images(section_pictures)
             for section, section_pictures in pictures.items()
         },
-        model=(folder / "model.toml").read_text(encoding="utf-8"),
+        model=result.model_toml,
     )
     path = folder / "report.html"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def order_sections(verdict: Json) -> dict[str, str]:
+def order_sections(verdict: Verdict) -> dict[str, str]:
     """Return the headings by section; the force that no effect explains comes first."""
-    if verdict["verdict"] != "unexplained":
+    if verdict.verdict != "unexplained":
         return SECTIONS
     return {"forces": SECTIONS["forces"]} | SECTIONS
 
 
 def list_parameter_rows(
-    verdict: Json, names: Sequence[str]
+    verdict: Verdict, names: Sequence[str]
 ) -> list[tuple[str, str, list[str], str]]:
     """Return (group, parameter, [value, low, high], unit) of all fitted values, lengths in mm."""
-    term = verdict["remainder"]["evidence"]
-    law = verdict["law"]
+    law = verdict.law
+    term = None if law else verdict.remainder.evidence
     groups = [
-        (format_effect(effect), effect["parameters"])
-        for effect in verdict["effects"]
-        if law is None or format_effect(effect) in law["with_effects"]
+        (format_effect(effect), effect.parameters)
+        for effect in verdict.effects
+        if law is None or format_effect(effect) in law.with_effects
     ]
     if law is not None:
-        groups += [(f"proposed law, {part['title']}", part["parameters"]) for part in law["terms"]]
-        term = None
-    groups += [(f"generic term, {term['term']}", term["parameters"])] if term else []
-    fitted_base = law["base"] if law else verdict["base"]
+        groups += [(f"proposed law, {part.title}", part.parameters) for part in law.terms]
+    groups += [(f"generic term, {term.term}", term.parameters)] if term else []
+    fitted_base = law.base if law else verdict.base
     base = {_gap_label(name, names): value for name, value in fitted_base.items()}
     rows = []
     for title, parameters in (*groups, ("base parameters, refitted", base)):
         for k, (name, value) in enumerate(parameters.items()):
-            factor, unit = (1e3, "mm") if value["unit"] == "m" else (1.0, value["unit"] or "–")
-            numbers = [factor * value[key] for key in ("value", "low", "high")]
-            texts = format_with_interval(*numbers)
+            factor, unit = (1e3, "mm") if value.unit == "m" else (1.0, value.unit or "–")
+            texts = format_with_interval(value, factor)
             rows.append(("" if k else title, name, texts, unit))
     return rows
 
@@ -121,20 +116,26 @@ def _gap_label(name: str, logs: Sequence[str]) -> str:
     return f"gap correction per side, {logs[int(number)]}" if number.isdigit() else name
 
 
-def format_with_interval(value: float, low: float, high: float) -> list[str]:
+def format_with_interval(interval: Interval, factor: float = 1.0) -> list[str]:
     """Format a value and its bounds with the decimals that show two digits of half the interval.
 
-    Without an interval each has `DIGITS` significant digits.
+    Without an interval each has `DIGITS` significant digits. All are multiplied by `factor`.
     """
+    value = factor * interval.value
+    if interval.low is None or interval.high is None:
+        return [format_significant(value, DIGITS), *2 * [format_significant(None)]]
+    low = factor * interval.low
+    high = factor * interval.high
+    numbers = (value, low, high)
     half_width = 0.5 * (high - low)
-    if not (half_width > 0 and math.isfinite(half_width)):
-        return [format_significant(number, DIGITS) for number in (value, low, high)]
+    if not half_width > 0:
+        return [format_significant(number, DIGITS) for number in numbers]
     decimals = max(0, 1 - math.floor(math.log10(half_width)))
     if decimals > MAX_DECIMALS or max(abs(low), abs(high)) >= MAX_PLAIN:
         size = max(abs(value), half_width)
         digits = max(DIGITS, 2 + math.floor(math.log10(size)) - math.floor(math.log10(half_width)))
-        return [format_significant(number, digits) for number in (value, low, high)]
-    return [_group_thousands(f"{number:z,.{decimals}f}") for number in (value, low, high)]
+        return [format_significant(number, digits) for number in numbers]
+    return [_group_thousands(f"{number:z,.{decimals}f}") for number in numbers]
 
 
 def _group_thousands(text: str) -> str:
@@ -157,11 +158,49 @@ def describe_held_out(view: DiscoveryView) -> str:
     )
 
 
-def _log_facts(log: PreparedLog) -> Json:
-    r = log.signals
-    gaps = [f"{1e3 * gap:g}" for gap in r.gaps_m]
-    return {
-        "name": r.name, "seconds": float(r.time_s[-1] - r.time_s[0]), "steps": len(log.steps),
-        "mass": r.mass_kg, "channels": r.channels,
-        "gaps": "no bumpers" if gaps[0] == "inf" else f"gaps {gaps[0]} and {gaps[1]} mm",
-    }  # fmt: skip
+@dataclass(frozen=True)
+class LogFacts:
+    """What was recorded: name, length, steps, mass, channels and gaps in words."""
+
+    name: str
+    seconds: float
+    steps: int
+    mass: float
+    channels: tuple[str, ...]
+    gaps: str
+
+
+def _log_facts(log: PreparedLog) -> LogFacts:
+    signals = log.signals
+    gaps = [f"{1e3 * gap:g}" for gap in signals.gaps_m]
+    return LogFacts(
+        name=signals.name,
+        seconds=float(signals.time_s[-1] - signals.time_s[0]),
+        steps=len(log.steps),
+        mass=signals.mass_kg,
+        channels=signals.channels,
+        gaps="no bumpers" if gaps[0] == "inf" else f"gaps {gaps[0]} and {gaps[1]} mm",
+    )
+
+
+def write_identification_page(folder: Path, fitted: FittedModel, model_name: str) -> Path:
+    """Write folder/report.html of an identification and its figures; return the path."""
+    text = render_page(
+        Path(__file__).with_name("identify.html"),
+        report=fitted.report,
+        estimate=format_estimate,
+        quantity=format_quantity,
+        sensor_lines=describe_sensors(fitted.report.sensors),
+        images=embed_images(draw_identification_figures(fitted.identification, folder)),
+        model=fitted.model_toml,
+        model_name=model_name,
+    )
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def format_estimate(estimate: Interval) -> str:
+    """Format an estimate with half its 95 % interval, or alone with four digits."""
+    half = estimate.half_width or None
+    return format_quantity(estimate.value, estimate.unit, half, digits=4)

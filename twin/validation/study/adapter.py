@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from twin.discovery.build_verdict import build_interval, build_parameter, build_verdict
 from twin.discovery.cross_checks import fitted_gap
 from twin.discovery.discover import PreparedLog, discover_effects, fit_known_effects
 from twin.discovery.identify import identify_parameters
 from twin.discovery.loading import load_logs, load_recordings
 from twin.discovery.parameters import GapKey
-from twin.discovery.serialize import interval_to_json, parameter_to_json, verdict_to_json
 from twin.model.model import Model
 from twin.setup.run_config import read_model_template
 
@@ -18,7 +18,19 @@ from twin.setup.run_config import read_model_template
 def run_discovery(case_dir: Path) -> dict[str, Any]:
     """Run discovery on the recording of a case; return the verdict as in verdict.json."""
     logs, notes, model = load_case(case_dir)
-    return verdict_to_json(discover_effects(logs, model), notes=notes)
+    verdict = build_verdict(discover_effects(logs, model), notes=notes).to_plain()
+    for effect in verdict["effects"]:
+        effect["parameters"] = {
+            name: cover_every_value(estimate) for name, estimate in effect["parameters"].items()
+        }
+    return verdict
+
+
+def cover_every_value(estimate: dict[str, Any]) -> dict[str, Any]:
+    """Return an estimate whose interval is infinite where it is unknown: it covers the truth."""
+    if estimate.get("low", 0.0) is None:
+        return estimate | {"low": -math.inf, "high": math.inf}
+    return estimate
 
 
 def run_identification(case_dir: Path) -> dict[str, Any]:
@@ -34,8 +46,13 @@ def run_identification(case_dir: Path) -> dict[str, Any]:
     sd = 2.0 * fit.std_errors.get(GapKey(0), math.inf)
     return {
         "verdict": "identified",
-        "parameters": {free.name: parameter_to_json(fit, free) for free in fit.free}
-        | {"gap": interval_to_json(sum(sides.values()), sd, "m")}
+        "parameters": {
+            name: cover_every_value(estimate.to_plain())
+            for name, estimate in (
+                *((free.name, build_parameter(fit, free)) for free in fit.free),
+                ("gap", build_interval(sum(sides.values()), sd, "m")),
+            )
+        }
         | {f"gap_{side}": {"value": value, "unit": "m"} for side, value in sides.items()},
         "rms_over_noise": math.sqrt(fit.cost),
         "warnings": [*result.warnings],

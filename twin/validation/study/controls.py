@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import PreparedLog, discover_effects
-from twin.discovery.serialize import verdict_to_json
 from twin.discovery.signals import LogSignals
 from twin.model.model import Model
 from twin.validation.study.adapter import load_case
@@ -55,12 +55,12 @@ def run_controls(root: Path, number: int) -> Json:
 
 def discover_reversed(logs: Sequence[PreparedLog], model: Model) -> Json:
     """Return the verdict on time-reversed recordings."""
-    return verdict_to_json(discover_effects([reverse_log(log) for log in logs], model))
+    return build_verdict(discover_effects([reverse_log(log) for log in logs], model)).to_plain()
 
 
 def discover_without(logs: Sequence[PreparedLog], model: Model, effects: Sequence[str]) -> Json:
     """Return the verdict with these effects removed from the library."""
-    return verdict_to_json(discover_effects(logs, model, without=effects))
+    return build_verdict(discover_effects(logs, model, without=effects)).to_plain()
 
 
 def summarize_verdict(verdict: Json) -> Json:

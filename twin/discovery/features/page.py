@@ -1,4 +1,4 @@
-"""Figures of a search by features: distances before and after, and the response curves."""
+"""HTML report of a search by features and its figures; the numbers are those of features.json."""
 
 import math
 from collections.abc import Iterator
@@ -10,13 +10,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from twin.discovery.feature_labels import label_feature, name_fit
 from twin.discovery.features.config import Feature
 from twin.discovery.features.curve import ResponseCurve
 from twin.discovery.features.fit import FeatureFit
-from twin.discovery.features.search import FeatureDiscovery
+from twin.discovery.features.search import FeatureDiscovery, describe_effects
+from twin.discovery.features.task import FeatureModel, label_feature, name_fit
+from twin.discovery.result import FeatureVerdict
+from twin.discovery.words import format_interval, name_effect
+from twin.drawing.page import embed_images, render_page
 from twin.drawing.plot_style import CaptionedFigure, Picture, save_figures
-from twin.results.summary import Json
+from twin.laws.library import find_effect
+from twin.laws.typesetting import typeset_law
 
 MAX_SHOWN_DISTANCE = 4.0  # in tolerances: what is farther off is drawn at the edge
 ROW_HEIGHT_IN, MARGIN_IN = 0.235, 1.0
@@ -26,10 +30,46 @@ RANGE_MARGIN_SHARE = 0.25  # of the frequencies of peaks and features, on either
 FIT_COLOURS = ("#8c8c8c", "#c0802a", "#3b82c4")
 PUBLISHED_COLOUR = "#2b9a4f"
 FIT_MARKERS = ("o", "D", "o")
+HEADLINES = {
+    "none needed": "No effect is needed: other parameters explain as much.",
+    "named": "The model lacks {names}.",
+    "ambiguous": "The features do not determine what is missing; {names} explains the most.",
+}
 
 
-def draw_feature_pairs(
-    discovery: FeatureDiscovery, content: Json, folder: Path
+def write_features_page(folder: Path, result: FeatureModel) -> Path:
+    """Write folder/report.html and its figures to folder/figures; return the path of the page."""
+    content, discovery = result.verdict, result.discovery
+    pairs = _draw_pairs(discovery, content, folder / "figures")
+    light, dark = (embed_images(pair[side] for pair in pairs) for side in (0, 1))
+    best = content.best_fit
+    text = render_page(
+        Path(__file__).with_name("page.html"),
+        content=content,
+        headline=format_features_headline(content),
+        best=best or content.refitted,
+        name=name_fit,
+        label=label_feature,
+        quantity=format_interval,
+        laws=[(typeset_law(find_effect(id).term), find_effect(id).residual)
+              for id in content.best],
+        terms=describe_effects,
+        pictures=list(zip(light, dark, strict=True)),
+        model=result.model_toml,
+    )  # fmt: skip
+    path = folder / "report.html"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def format_features_headline(content: FeatureVerdict) -> str:
+    """Return the result of a search by features as one sentence."""
+    names = " and ".join(name_effect(effect) for effect in content.best)
+    return HEADLINES[content.verdict].format(names=names)
+
+
+def _draw_pairs(
+    discovery: FeatureDiscovery, content: FeatureVerdict, folder: Path
 ) -> list[tuple[Picture, Picture]]:
     """Draw the figures in `folder`; return pairs on a light and on a dark ground."""
     light = save_figures(_draw_figures(discovery, content), folder)
@@ -37,7 +77,9 @@ def draw_feature_pairs(
     return list(zip(light, dark, strict=True))
 
 
-def _draw_figures(discovery: FeatureDiscovery, content: Json) -> Iterator[CaptionedFigure]:
+def _draw_figures(
+    discovery: FeatureDiscovery, content: FeatureVerdict
+) -> Iterator[CaptionedFigure]:
     yield _draw_distances(discovery, content)
     yield _draw_curves(discovery)
 
@@ -51,8 +93,8 @@ def list_shown_fits(discovery: FeatureDiscovery) -> list[tuple[str, FeatureFit]]
     return fits
 
 
-def _draw_distances(discovery: FeatureDiscovery, content: Json) -> CaptionedFigure:
-    features, fits = content["features"], list_shown_fits(discovery)
+def _draw_distances(discovery: FeatureDiscovery, content: FeatureVerdict) -> CaptionedFigure:
+    features, fits = content.features, list_shown_fits(discovery)
     figure = Figure(figsize=(10.0, MARGIN_IN + ROW_HEIGHT_IN * len(features)))
     axis = figure.subplots()
     rows = np.arange(len(features))
