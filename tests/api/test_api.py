@@ -83,7 +83,11 @@ def test_a_discovery_has_the_verdict_and_the_model(log_file: Path, tmp_path: Pat
         api.discover([log_file], without=["no_effect"])
 
 
-HIDDEN_SPRING = '[[effects]]\nid = "saturating_stiffness"\nparameters = { stiffness = 4000.0, length = 0.006 }\n'
+HIDDEN_SPRING = """
+[[effects]]
+id = "saturating_stiffness"
+parameters = { stiffness = 4000.0, length = 0.006 }
+"""
 TEST = """
 title = "short"
 rig = "rig.toml"

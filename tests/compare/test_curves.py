@@ -380,9 +380,9 @@ def test_a_sudden_change_needs_two_points_of_one_direction() -> None:
 def test_amplitudes_beyond_a_tenth_and_the_scatter_are_different_solutions(
     eta: float, is_apart: bool
 ) -> None:
-    one, other = replace(measured(1.0), spread=0.05), replace(measured(eta), spread=0.05)
-    assert (compare_amplitudes(one, other) > 1) == is_apart
-    assert compare_amplitudes(one, other, allowance=1.0) < 1
+    first, second = (replace(measured(value), spread=0.05) for value in (1.0, eta))
+    assert (compare_amplitudes(first, second) > 1) == is_apart
+    assert compare_amplitudes(first, second, allowance=1.0) < 1
 
 
 def test_many_sweeps_at_once_are_judged_as_one_by_one() -> None:

@@ -28,6 +28,7 @@ from table_io.records import (
 )
 from tests.builders.blocks import recut_blocks
 from twin.compare import pipeline
+from twin.compare.monitoring.jumps import ExpectedJump
 from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import Item, encode_item
 
@@ -57,7 +58,9 @@ def bundle() -> RunConfig:
 
 @pytest.fixture(scope="module")
 def setup(bundle: RunConfig) -> pipeline.PipelineSetup:
-    return bundle.prepare_twin()
+    """With a jump of the model between both frequencies, which so coarse a grid hides."""
+    jump = ExpectedJump(bundle.steps[0], bundle.steps[1], "down")
+    return replace(bundle.prepare_twin(), expected_jumps=(jump,))
 
 
 @pytest.fixture(scope="module")

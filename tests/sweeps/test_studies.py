@@ -196,8 +196,7 @@ def test_a_plug_in_effect_is_played_like_any_other(
     profile: Path, draft: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = EffectParameter("k3", "N/m3", 0.0, 1e10, 0.0, 1e6, "")
-    cubic = Effect("my_cubic", "k3 u^3", (number,), "force", "", (),
-                   force=lambda q, w, c: c[0] * q * q * q)  # fmt: skip
+    cubic = Effect("my_cubic", (number,), term="k3 u^3", force="k3 * u * u * u")
 
     @dataclass
     class Entry:

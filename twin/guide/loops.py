@@ -19,7 +19,6 @@ from twin.laws.effect import Effect
 from twin.laws.library import EFFECTS
 from twin.model.model import Model
 from twin.model.parameters import Parameters
-from twin.model.prepare import prepare_solver
 
 LOOPS_FILE = Path(__file__).with_name("loops.json")
 # Damper, bumpers and level of the shipped model and tests.
@@ -98,6 +97,8 @@ def _simulate_loop(model: Model, frequency_hz: float) -> ForceLoop:
     phase = 2 * math.pi * np.arange(1, SETTLE_CYCLES * SAMPLES_PER_CYCLE + 1) / SAMPLES_PER_CYCLE
     wave = np.sin(phase)
     level = LEVEL_G * GRAVITY_M_S2
+    from twin.model.prepare import prepare_solver  # the guide itself needs no compiler
+
     solver, out = prepare_solver(model, rate_hz), np.empty((7, wave.size))
     state = solver.rest_state()
     solver.advance(state, level * wave, -level / (2 * math.pi * frequency_hz) ** 2 * wave, out)

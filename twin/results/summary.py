@@ -39,7 +39,8 @@ from twin.compare.pipeline import EVENT_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
-from twin.results.contracts import Contract, RunSummary
+from twin.results.contract import Contract
+from twin.results.contracts import RunSummary
 from twin.results.excitation_verdict import judge_excitation
 from twin.results.orbits import find_measured_folds, summarise_orbits
 from twin.results.table_motion import format_tracking, summarise_tracking
