@@ -17,7 +17,7 @@ from pathlib import Path
 
 from table_io.config.folders import resolve_config
 from table_io.errors import InputError
-from twin.discovery.decide import Decision, decide
+from twin.discovery.decide import DecidedTests, decide
 from twin.discovery.decisive_test import DecideOptions
 from twin.discovery.features.task import FeatureModel, discover_features
 from twin.discovery.result import FeatureVerdict, IdentificationReport, Interval, Verdict
@@ -36,7 +36,7 @@ from twin.studies.maps.results import open_study
 
 __all__ = [
     "DecideOptions",
-    "Decision",
+    "DecidedTests",
     "DiscoveredModel",
     "DriveResult",
     "FeatureModel",

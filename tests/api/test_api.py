@@ -121,12 +121,12 @@ def test_discover_and_identify_return_what_the_commands_write(truth: str, tmp_pa
     log = api.run_simulated(tmp_path / "test.toml", tmp_path / "run").path
     without = [effect.id for effect in EFFECTS]
 
-    found = api.discover([log], without=without)
+    discovered = api.discover([log], without=without)
     run_discovery([log], "snm", tmp_path / "found", without)
     written = json.loads((tmp_path / "found" / "verdict.json").read_text())
-    assert json.loads(found.verdict.to_json()) | {"seconds": 0} == written | {"seconds": 0}
-    assert found.model_toml == (tmp_path / "found" / "model.toml").read_text()
-    assert (found.verdict.law is not None) == bool(truth)
+    assert json.loads(discovered.verdict.to_json()) | {"seconds": 0} == written | {"seconds": 0}
+    assert discovered.model_toml == (tmp_path / "found" / "model.toml").read_text()
+    assert (discovered.verdict.law is not None) == bool(truth)
 
     fitted = api.identify([log])
     run_identification([log], "snm", tmp_path / "fitted.toml")

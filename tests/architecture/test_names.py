@@ -49,7 +49,7 @@ IRREGULAR_PARTICIPLES = frozenset(
 NOUNS_IN_ED = frozenset({"feed", "need", "seed", "speed"})
 VAGUE = frozenset({"one", "found", "said", "now", "there", "told", "heard", "seen"})
 # Data attributes of the public `twin.log`, written in users' notebooks.
-PUBLIC_ATTRIBUTES = frozenset({"held", "measured", "predicted"})
+PUBLIC_ATTRIBUTES = frozenset({"held", "measured", "predicted", "converged", "undetermined"})
 # Interfaces that several modules implement under one name.
 SHARED_FUNCTIONS = frozenset({
     "check_reachable", "discover_devices",  # of each kind of hardware

@@ -10,14 +10,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from table_io.errors import InputError
-from twin.discovery.decide import Operator, decide
+from twin.discovery.decide import TestOperator, decide
 from twin.discovery.decisive_test import DecideOptions, TestProposal
 from twin.discovery.features.page import write_features_page
 from twin.discovery.features.task import (
     FeatureProgress,
-    describe_fit,
     discover_features,
-    label_feature,
 )
 from twin.discovery.least_squares import INTERVAL_SIGMA
 from twin.discovery.page import write_discovery_page, write_identification_page
@@ -28,6 +26,8 @@ from twin.discovery.result import (
     IdentificationReport,
     Interval,
     Verdict,
+    describe_fit,
+    label_feature,
 )
 from twin.discovery.selection import Cancelled, ProgressCallback, SelectionProgress
 from twin.discovery.task import DiscoveredModel, PathLike, discover, identify
@@ -125,8 +125,8 @@ def _keep_result(result: DiscoveredModel, folder: Path, profile: Path | None = N
     print_line(f"{folder}")
 
 
-class ConsoleOperator(Operator):
-    """Operator at the console: sees the verdicts and is asked before the table moves."""
+class ConsoleOperator(TestOperator):
+    """TestOperator at the console: sees the verdicts and is asked before the table moves."""
 
     def __init__(self, options: DecideOptions) -> None:
         self._asks = options.asks
@@ -312,12 +312,12 @@ def print_identification(report: IdentificationReport) -> None:
             f"{estimate.deviations:+.1f}" if estimate.deviations else "",
         )  # fmt: skip
     for log, gap in report.gaps.items():
-        if gap.fitted:
-            half = gap.fitted.half_width
-            difference = gap.fitted.value - gap.stated
+        if gap.interval:
+            half = gap.interval.half_width
+            difference = gap.interval.value - gap.stated
             table.add_row(
                 f"gap of {log}",
-                *_format_interval(gap.fitted, 1e3),
+                *_format_interval(gap.interval, 1e3),
                 "mm",
                 f"{1e3 * gap.stated:g}",
                 f"{INTERVAL_SIGMA * difference / half:+.1f}" if half else "",
@@ -345,7 +345,7 @@ def print_identification(report: IdentificationReport) -> None:
 def _print_subsets(report: IdentificationReport) -> None:
     """Print the estimates from subsets of the samples, and the gaps from contact onsets."""
     names = [name for name in report.parameters if name in SYMBOLS]
-    gaps = [log for log, name in enumerate(report.logs) if report.gaps[name].fitted]
+    gaps = [log for log, name in enumerate(report.logs) if report.gaps[name].interval]
     table = Table(title="Estimates from subsets of the samples", title_justify="left")
     table.add_column("")
     for name in names:

@@ -19,7 +19,7 @@ from twin.setup.folders import make_output_folder, make_run_folder
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 
-class Operator:
+class TestOperator:
     """Judges, and is asked and told, while tests are played; this one accepts all silently."""
 
     def judge(
@@ -46,7 +46,7 @@ class Operator:
 
 
 @dataclass(frozen=True, eq=False)
-class Decision:
+class DecidedTests:
     """Chain of verdicts in `folder`, why it ended, and the exit code."""
 
     folder: Path
@@ -61,13 +61,13 @@ class _Chain:
 
     folder: Path
     options: DecideOptions
-    operator: Operator
+    operator: TestOperator
     links: list[ChainLink] = field(default_factory=list)
     results: list[DiscoveredModel] = field(default_factory=list)
 
-    def end(self, reason: str, code: int = 0) -> Decision:
+    def end(self, reason: str, code: int = 0) -> DecidedTests:
         self.operator.tell(reason)
-        return Decision(self.folder, reason, tuple(self.results), code)
+        return DecidedTests(self.folder, reason, tuple(self.results), code)
 
 
 def decide(
@@ -77,8 +77,8 @@ def decide(
     held_out: Sequence[PathLike] = (),
     options: DecideOptions | None = None,
     out: PathLike | None = None,
-    operator: Operator | None = None,
-) -> Decision:
+    operator: TestOperator | None = None,
+) -> DecidedTests:
     """Judge recordings, play the proposed test and judge again, until decided.
 
     Ends too when no test separates, none is left that the rig plays, or the rig time is used up.
@@ -86,7 +86,7 @@ def decide(
     """
     paths = [Path(log) for log in logs]
     options = options or DecideOptions(asks=False)
-    operator = operator or Operator()
+    operator = operator or TestOperator()
     folder, _ = make_run_folder(None if out is None else Path(out), "decide")
     if not options.rig:
         rig = folder / "rig.toml"
@@ -120,7 +120,7 @@ def decide(
         proposal, code = _play_best(chain, result, verdict_folder, run_folder)
         if proposal is None:
             if code:
-                return Decision(folder, "stopped", tuple(chain.results), code)
+                return DecidedTests(folder, "stopped", tuple(chain.results), code)
             return chain.end("not decided: no proposed test is left to play")
         paths.append(run_folder)
         played_min = measure_minutes(run_folder)

@@ -4,6 +4,7 @@ Each is computed, drawn, printed and written as it is; a key is written here onl
 """
 
 import math
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -19,6 +20,7 @@ from twin.results.contract import (
     declare_unit,
 )
 
+REFITTED_BASE = "the refitted base"
 Misfit = Annotated[Real, declare_unit("1")]  # or another ratio that is always computed
 
 
@@ -317,7 +319,7 @@ class IdentifiedGap(Contract):
     high: Number = Field(None, description="upper end of its 95 % interval, in `unit`")
 
     @property
-    def fitted(self) -> Interval | None:
+    def interval(self) -> Interval | None:
         """The fitted gap; None without contact."""
         if self.value is None:
             return None
@@ -446,3 +448,25 @@ class FeatureVerdict(Contract):
     def best_fit(self) -> FeatureFitResult | None:
         """The fit of the best effects; None if the refitted base is best."""
         return next((fit for fit in self.fits if fit.effects == self.best), None)
+
+
+def name_fit(names: Sequence[str]) -> str:
+    """Return the name of a fit: its effects, or that of the base."""
+    return " + ".join(names) or REFITTED_BASE
+
+
+def label_feature(entry: FeatureResult) -> str:
+    """Return a feature of features.json with its gap."""
+    gap_m = entry.gap_m
+    if entry.kind == "permanent_contact_gap":
+        return entry.published
+    gap = "G∞" if gap_m is None else f"G{1e3 * gap_m:g}"
+    return f"{gap}: {entry.published}"
+
+
+def describe_fit(entry: FeatureFitResult, count: int) -> str:
+    """Return a fit in a line: its effects, what it explains, and the price."""
+    return (
+        f"{name_fit(entry.effects)}: {entry.explained} of {count}, gains "
+        f"{len(entry.gained)}, loses {len(entry.lost)}; misfit {entry.misfit:.2f}"
+    )

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import typer
 
-from twin.discovery.features.task import label_feature, name_fit
-from twin.discovery.result import FeatureVerdict, Interval
+from twin.discovery.result import FeatureVerdict, Interval, label_feature, name_fit
 from twin.guide.reference import format_table
 from twin.results.quantities import format_quantity
 

@@ -130,7 +130,12 @@ def write_api_reference(_: typer.Typer) -> str:
     """
     modules = [
         ast.parse((PACKAGES_DIR / name).read_text(encoding="utf-8"))
-        for name in ("twin/api.py", "twin/log/__init__.py", "twin/studies/maps/results.py")
+        for name in (
+            "twin/api.py",
+            "twin/log/__init__.py",
+            "twin/studies/maps/results.py",
+            "twin/discovery/task.py",
+        )
     ]
     nodes = {
         node.name: node

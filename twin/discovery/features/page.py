@@ -14,8 +14,8 @@ from twin.discovery.features.config import Feature
 from twin.discovery.features.curve import ResponseCurve
 from twin.discovery.features.fit import FeatureFit
 from twin.discovery.features.search import FeatureDiscovery, describe_effects
-from twin.discovery.features.task import FeatureModel, label_feature, name_fit
-from twin.discovery.result import FeatureVerdict
+from twin.discovery.features.task import FeatureModel
+from twin.discovery.result import FeatureVerdict, label_feature, name_fit
 from twin.discovery.words import format_interval, name_effect
 from twin.drawing.page import embed_images, render_page
 from twin.drawing.plot_style import CaptionedFigure, Picture, save_figures

@@ -32,6 +32,7 @@ from twin.discovery.result import (
     FeatureVerdict,
     Interval,
     PredictedFeatureResult,
+    name_fit,
 )
 from twin.discovery.task import ModelResult, PathLike
 from twin.laws.library import find_effect
@@ -39,7 +40,6 @@ from twin.setup.run_config import read_model
 from twin.system.process_pool import Task, Workers, run_tasks
 
 MIN_LEAD = 2  # features: a lead of one can be an accident of its tolerance
-REFITTED = "the refitted base"
 
 
 @dataclass(frozen=True)
@@ -272,25 +272,3 @@ def _format_model(discovery: FeatureDiscovery, model_title: str) -> str:
     effects = {(each.effect.id, each.channel): each.values for each in model.effects}
     intervals = {str(key): interval for key, interval in best.intervals.items()}
     return format_model_toml(texts, model.base, effects, intervals)
-
-
-def name_fit(names: Sequence[str]) -> str:
-    """Return the name of a fit: its effects, or that of the base."""
-    return " + ".join(names) or REFITTED
-
-
-def label_feature(entry: FeatureResult) -> str:
-    """Return a feature of features.json with its gap."""
-    gap_m = entry.gap_m
-    if entry.kind == "permanent_contact_gap":
-        return entry.published
-    gap = "G∞" if gap_m is None else f"G{1e3 * gap_m:g}"
-    return f"{gap}: {entry.published}"
-
-
-def describe_fit(entry: FeatureFitResult, count: int) -> str:
-    """Return a fit in a line: its effects, what it explains, and the price."""
-    return (
-        f"{name_fit(entry.effects)}: {entry.explained} of {count}, gains "
-        f"{len(entry.gained)}, loses {len(entry.lost)}; misfit {entry.misfit:.2f}"
-    )

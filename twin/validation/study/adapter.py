@@ -15,7 +15,7 @@ from twin.model.model import Model
 from twin.setup.run_config import read_model_template
 
 
-def run_discovery(case_dir: Path) -> dict[str, Any]:
+def discover_in_case(case_dir: Path) -> dict[str, Any]:
     """Run discovery on the recording of a case; return the verdict as in verdict.json."""
     logs, notes, model = load_case(case_dir)
     verdict = build_verdict(discover_effects(logs, model), notes=notes).to_plain()
@@ -33,7 +33,7 @@ def cover_every_value(estimate: dict[str, Any]) -> dict[str, Any]:
     return estimate
 
 
-def run_identification(case_dir: Path) -> dict[str, Any]:
+def identify_in_case(case_dir: Path) -> dict[str, Any]:
     """Run identification on the recording of a case; return parameters and gaps with intervals.
 
     The gap of a side has no interval, as in the output of `identify`.

@@ -20,7 +20,7 @@ from twin.compare.curves import FloatND
 from twin.model.model import EffectInstance
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
-from twin.validation.study.adapter import run_discovery
+from twin.validation.study.adapter import discover_in_case
 from twin.validation.study.generation import hash_truth, record_test
 from twin.validation.study.rig_setup import MODEL_TOML, make_rig_toml
 
@@ -42,7 +42,7 @@ def judge_case(case: SampledCase, seed: int) -> FloatND:
     truth = [instance.effect.id for instance in case.model.present_effects]
     with tempfile.TemporaryDirectory() as folder:
         record_case(case, seed, Path(folder))
-        verdict = run_discovery(Path(folder))
+        verdict = discover_in_case(Path(folder))
     named = [effect["id"] for effect in verdict["effects"]]
     is_right = sorted(named) == sorted(truth)
     gap = verdict.get("gap") or {}

@@ -9,9 +9,9 @@ from typing import Any
 from table_io.clock import cpu_seconds
 from twin.results.summary import dump_strict_json
 from twin.validation.study.adapter import (
+    discover_in_case,
     fit_true_structure,
-    run_discovery,
-    run_identification,
+    identify_in_case,
 )
 from twin.validation.study.baselines import find_baselines
 from twin.validation.study.generation import CasePaths, generate_case
@@ -25,7 +25,7 @@ Method = Callable[[Path], Json]  # folder of a case -> verdict as in verdict.jso
 BASELINES: dict[str, Method] = find_baselines()
 
 
-def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Json:
+def evaluate_case(root: Path, number: int, method: Method = discover_in_case) -> Json:
     """Return the row of a case; a failed verdict counts as a miss, with the error in `failed`.
 
     A case without the size of its cell, or stopped by protection, is excluded.
@@ -41,7 +41,7 @@ def evaluate_case(root: Path, number: int, method: Method = run_discovery) -> Js
     if not about["sized"]:
         return select_case_facts(about) | {"label": case.label, "made_in": made_s - start_s}
     is_identified = about["kind"] == "identify"
-    verdict, failure = run_method(run_identification if is_identified else method, paths.case_dir)
+    verdict, failure = run_method(identify_in_case if is_identified else method, paths.case_dir)
     evaluated_s = cpu_seconds()
     paths.verdict.write_text(dump_strict_json(verdict), encoding="utf-8")
     timing = {
