@@ -21,7 +21,7 @@ from twin.model.model import Model
 # Of the frequency of a jump, where the grid is finer: gaps, masses and lasers are known well enough
 # to place a jump to 1 %, and slow passage moves it as much again.
 JUMP_TOLERANCE = 0.02
-BLEND_CYCLES = 2  # between two steps, about
+MIN_FORECAST_CYCLES = 20  # at each step, after which a motion has left a branch that ended
 MAX_FORECAST_CYCLES = 4000  # driven before a test; an integrated model needs 0.3 ms for each
 
 
@@ -58,7 +58,8 @@ def predict_jumps(
     if not steps:
         return ()
     averaged = profile.sweep.measured_cycles
-    cycles = min(profile.sweep.cycles + BLEND_CYCLES, MAX_FORECAST_CYCLES // len(steps))
+    cycles = max(profile.sweep.cycles, MIN_FORECAST_CYCLES)
+    cycles = min(cycles, MAX_FORECAST_CYCLES // len(steps))
     response = simulate_sweep(
         model,
         np.array([step.frequency_hz for step in steps]),
