@@ -14,9 +14,11 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
+from tests.command_line import call_main
 from twin.rig.check import find_worst_rows, print_plan, select_rows, sum_durations_s
 from twin.rig.drive_figure import draw_drive
 from twin.rig.predicted_ranges import format_clipping_warnings, predict_response
+from twin.setup.folders import make_output_folder, remove_empty_folders
 from twin.setup.run_config import RunConfig, from_texts, read_run_config
 
 RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
@@ -189,3 +191,33 @@ def test_a_record_is_identified_by_checksum_and_peaks() -> None:
         ],
         rel=1e-3,
     )
+
+
+@pytest.mark.parametrize("title", ["[/a]", "[bold]gap [m]", "a\\[b]"])
+def test_brackets_of_a_title_are_shown_as_they_are(title: str, tmp_path: Path) -> None:
+    profile = tmp_path / "test.toml"
+    profile.write_text(TEST.replace('"Short"', f"'{title}'"))
+    result = call_main("check", profile)
+    assert result.returncode == 0, result.stderr
+    assert title in result.stdout
+
+
+def test_units_of_effects_are_listed() -> None:
+    assert "[m]" in call_main("list", "effects").stdout
+
+
+def test_a_refused_command_leaves_no_folder(tmp_path: Path) -> None:
+    missing = tmp_path / "missing.mcap"
+    assert call_main("compare", missing, missing, cwd=tmp_path).returncode == 2
+    assert call_main("discover", missing, cwd=tmp_path).returncode == 2
+    assert call_main("check", tmp_path / "no.toml", "--out", tmp_path / "out").returncode == 2
+    assert not [*tmp_path.rglob("runs/*")]
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_with_results_stays_after_a_refusal(tmp_path: Path) -> None:
+    empty, full = (make_output_folder(tmp_path / name, "") for name in ("empty", "full"))
+    (full / "run.mcap").write_bytes(b"recorded")
+    remove_empty_folders()
+    assert not empty.exists()
+    assert (full / "run.mcap").exists()

@@ -637,6 +637,9 @@ def main() -> None:
 
             if not isinstance(error, InputError):
                 raise
+            from twin.setup.folders import remove_empty_folders
+
+            remove_empty_folders()
             print(f"shaketwin: {error}", file=sys.stderr)
             raise SystemExit(2) from None
         except OSError as error:

@@ -88,7 +88,7 @@ def run_export(options: ExportOptions) -> None:
             f"warning: {options.log} is unfinished or has invalid items; "
             f"`shaketwin verify {options.log}` lists what is missing"
         )
-        error_console.print(warning, highlight=False, markup=False, soft_wrap=True)
+        error_console.print(warning, highlight=False, soft_wrap=True)
     for path in exported.files:
         has_rows = path.suffix not in (".rrd", ".json")
         size = f"{exported.rows} rows of {exported.columns} columns -> " if has_rows else ""

@@ -52,8 +52,8 @@ def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: Mo
     write_paper_page(rows, study, source, figure_sets, folder / "report.html")
     for row in rows:
         print_line(f"{row.case}: paper: {row.paper}; {source.name}: {row.model}")
-        style = "[bold red]" if row.verdict == DEPARTS else ""
-        console.print(f"    {style}{row.verdict}", highlight=False)
+        style = "bold red" if row.verdict == DEPARTS else ""
+        console.print(f"    {row.verdict}", style=style, highlight=False)
     departures = sum(row.verdict == DEPARTS for row in rows)
     print_line(
         f"{source.name}: {len(rows)} statements, {departures} depart -> {folder / 'report.html'}"

@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from rich.markup import escape
-
 from twin.recording.reader import read_recording
 from twin.results import summary as summaries
 from twin.results.excitation_verdict import format_excitation_verdict
@@ -59,4 +57,4 @@ def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
 
 def _print_coloured(line: str, verdict: str) -> None:
     colour = VERDICT_COLOURS[verdict]
-    console.print(f"[bold {colour}]{escape(line)}[/]", highlight=False, soft_wrap=True)
+    console.print(line, style=f"bold {colour}", highlight=False, soft_wrap=True)

@@ -50,7 +50,7 @@ def check_profile(profile: Path, table: str | None, out: Path | None) -> None:
 
 def print_plan(console: Console, config: RunConfig) -> None:
     """Print the plan of a test: steps, duration, buffer, and margins to the rig's limits."""
-    console.print(f"[bold]{config.profile.title}[/bold]", highlight=False)
+    console.print(config.profile.title, style="bold", highlight=False)
     for name, text in _plan_lines(config):
         console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
     predicted = predict_response(config)

@@ -1,6 +1,7 @@
 """Result folders, whose content is never overwritten, and state files, replaced as a whole."""
 
 import os
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from twin.setup.run_config import make_run_id
 from twin.system.files import lock_folder
 
 RUNS_FOLDER = Path("runs")
+_made_folders: list[Path] = []  # by this process
 
 
 def make_run_folder(out: Path | None, name: str) -> tuple[Path, str]:
@@ -28,10 +30,13 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
     try:
         if out is None:
             folder = _make_free_folder(folder)
+            _made_folders.append(folder)
             claim_folder(folder)
         elif out.exists() and not out.is_dir():
             raise _make_content_error(out)
         else:
+            if not out.exists():
+                _made_folders.append(out)
             folder.mkdir(parents=True, exist_ok=True)
             claim_folder(folder)
             if any(folder.iterdir()):
@@ -47,6 +52,13 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
             remedy="give a folder on a disk that you may write to",
         ) from None
     return folder
+
+
+def remove_empty_folders() -> None:
+    """Remove the folders that this process made and wrote nothing to: of a refused command."""
+    while _made_folders:
+        with suppress(OSError):  # it has content, or is gone
+            _made_folders.pop().rmdir()
 
 
 def claim_folder(folder: Path) -> None:

@@ -110,7 +110,7 @@ class RunProgress:
     def print_line(self, text: str) -> None:
         """Print one line above the bar, without nonprintable characters (a remote twin's text)."""
         text = replace_nonprintable(text)
-        self._console.print(text, highlight=False, markup=False, soft_wrap=True)
+        self._console.print(text, highlight=False, soft_wrap=True)
 
     def _print_gap(self, gap: SampleGap) -> None:
         """Print the first gap of a series, and once that more follow: a block may bring each."""

@@ -27,7 +27,10 @@ def _console_columns() -> int | None:
 
 
 class SafeConsole(Console):
-    """Console that replaces what a terminal would obey in text: names and titles may be foreign."""
+    """Console that replaces what a terminal would obey in text: names and titles may be foreign.
+
+    For the same reason brackets in text are no markup; styles are arguments.
+    """
 
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
@@ -37,13 +40,13 @@ class SafeConsole(Console):
             yield Segment(replace_escapes(segment.text), segment.style) if is_text else segment
 
 
-console = SafeConsole(width=_console_columns())
-error_console = SafeConsole(stderr=True)
+console = SafeConsole(width=_console_columns(), markup=False)
+error_console = SafeConsole(stderr=True, markup=False)
 
 
 def print_line(text: str) -> None:
     """Print a line verbatim, without markup; only the terminal wraps it."""
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
+    console.print(text, highlight=False, soft_wrap=True)
 
 
 def draw_qr_code(text: str) -> list[str]:
