@@ -73,14 +73,16 @@ class CampaignGap(PaperCase):
             point
             for test in self.tests
             for point in test.points
-            if not _is_covered_finer(point.frequency_hz, test.profile.sweep, sweeps)
+            if not _is_covered_finer(point, test.profile.sweep, sweeps)
         )
 
 
-def _is_covered_finer(hz: float, of: Sweep, sweeps: list[Sweep]) -> bool:
-    """Return whether another sweep covers a frequency in finer steps."""
+def _is_covered_finer(point: PrcPoint, of: Sweep, sweeps: list[Sweep]) -> bool:
+    """Return whether another sweep covers a point of a sweep in finer steps, in its direction."""
     return any(
-        sweep.step_hz < of.step_hz and sweep.start_hz - NEAR_HZ <= hz <= sweep.stop_hz + NEAR_HZ
+        sweep.step_hz < of.step_hz
+        and point.direction in sweep.directions
+        and sweep.start_hz - NEAR_HZ <= point.frequency_hz <= sweep.stop_hz + NEAR_HZ
         for sweep in sweeps
     )
 
