@@ -211,8 +211,7 @@ def test_a_refused_command_leaves_no_folder(tmp_path: Path) -> None:
     assert call_main("compare", missing, missing, cwd=tmp_path).returncode == 2
     assert call_main("discover", missing, cwd=tmp_path).returncode == 2
     assert call_main("check", tmp_path / "no.toml", "--out", tmp_path / "out").returncode == 2
-    assert not [*tmp_path.rglob("runs/*")]
-    assert not (tmp_path / "out").exists()
+    assert not [*tmp_path.iterdir()]
 
 
 def test_a_folder_with_results_stays_after_a_refusal(tmp_path: Path) -> None:

@@ -29,14 +29,16 @@ def make_output_folder(out: Path | None, run_name: str) -> Path:
     folder = RUNS_FOLDER / run_name if out is None else out
     try:
         if out is None:
+            if not folder.parent.exists():
+                _made_folders.append(folder.parent.absolute())
             folder = _make_free_folder(folder)
-            _made_folders.append(folder)
+            _made_folders.append(folder.absolute())
             claim_folder(folder)
         elif out.exists() and not out.is_dir():
             raise _make_content_error(out)
         else:
             if not out.exists():
-                _made_folders.append(out)
+                _made_folders.append(out.absolute())
             folder.mkdir(parents=True, exist_ok=True)
             claim_folder(folder)
             if any(folder.iterdir()):
