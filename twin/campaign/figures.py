@@ -116,7 +116,7 @@ def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], Measured
             point
             for run in runs
             for point in prc_points(run.summary["steps"])
-            if not _is_covered_finer(point.frequency_hz, run.profile.sweep, sweeps)
+            if not _is_covered_finer(point, run.profile.sweep, sweeps)
         ]
     return cases, measured_campaign
 
