@@ -101,7 +101,7 @@ step_hz = 0.2
 cycles = 4
 acceleration_g = 0.05
 [acquisition]
-rate_hz = 500.0
+rate_hz = 1000.0
 block_samples = 50
 [loop_check]
 enabled = false
