@@ -5,6 +5,7 @@ import hashlib
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -36,6 +37,7 @@ from twin.compare.monitoring.cycle import ChannelNoise, CycleData, weight_functi
 from twin.compare.monitoring.jumps import (
     ExpectedJump,
     JumpTracking,
+    measure_separation,
     predict_jumps,
     track_jumps,
 )
@@ -280,7 +282,9 @@ def track_sweep(
     )
     tracking, items = JumpTracking(expected or jumps_of_twin), list[Record]()
     for place, (eta, twin_eta) in enumerate(zip(etas, twin_etas, strict=True)):
-        tracking, new_items = track_jumps(tracking, point(place, eta, twin_eta))
+        sweep_point = point(place, eta, twin_eta)
+        is_apart = measure_separation(sweep_point, ChannelNoise(), 1.0) > 1
+        tracking, new_items = track_jumps(tracking, sweep_point, is_apart)
         items.extend(new_items)
     return items
 
@@ -301,6 +305,21 @@ def test_a_jump_comes_with_that_of_the_twin_or_is_a_warning(
     etas: list[float], twin_etas: list[float], kinds: list[str]
 ) -> None:
     assert [event.kind for event in warnings(track_sweep(etas, twin_etas))] == kinds
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "impacts", "is_apart"), [(0.0, 0, True), (4e-5, 0, False), (0.0, 1, False)]
+)
+def test_noise_and_gap_errors_belong_to_the_tolerance_of_a_branch(
+    noise_m: float, impacts: int, is_apart: bool
+) -> None:
+    """Of two amplitudes of 0.30 and 0.36 mm."""
+    sweep_point = point(0, 0.010, 0.012)
+    assert sweep_point.measured is not None
+    measured = replace(sweep_point.measured, impacts_right=(impacts,))
+    noise = ChannelNoise(("rel_disp_m",), np.array([noise_m]))
+    share = measure_separation(replace(sweep_point, measured=measured), noise, 0.03)
+    assert (share > 1) == is_apart
 
 
 @pytest.mark.parametrize(("twin_step", "is_reported"), [(2, False), (3, False), (5, True)])

@@ -13,6 +13,7 @@ import pytest
 from table_io.block import Block
 from table_io.config.toml_text import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
+from twin.compare.monitoring.cycle import ChannelNoise
 from twin.recording.reader import read_recording
 from twin.results.summary import Json, summarise, write_summary
 from twin.results.twin_verdict import (
@@ -214,7 +215,7 @@ def test_the_free_twin_is_on_the_branch_by_amplitude_and_phase(
         for eta in (0.2, twin_eta)
     )
     point = PrcPoint(100, 0, "forward", 2.0, measured, twin, 0.5, 0.5, 0.0)
-    branch = compare_branches(point, free_error, 1e-5, 0.03)
+    branch = compare_branches(point, free_error, ChannelNoise(), 0.03)
     assert branch is not None
     assert branch["is_same"] == is_same
 

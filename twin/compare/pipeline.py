@@ -374,7 +374,9 @@ def _evaluate_step(
         point = build_prc_point(step, list(state.cycles), base_acc, setup.scale, state.onsets)
         items.append(point)
         if step not in setup.added_steps:
-            monitoring_state, events = monitoring.monitor_step(monitoring_state, point)
+            monitoring_state, events = monitoring.monitor_step(
+                monitoring_state, point, setup.scale.u_star_m
+            )
             items.extend(events)
     # The contact state is not tracked through the blend to the next step.
     return replace(

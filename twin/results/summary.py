@@ -89,7 +89,6 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         {index: measured_cycles / step.frequency_hz for index, step in demanded.items()},
         start.rate_hz,
     )
-    noise_m = _compared_noise(noise, "rel_disp_m")
 
     def describe_step(point: PrcPoint) -> Json:
         entry = _step_entry(point)
@@ -98,7 +97,7 @@ def summarise(recording: Recording, parameters: Parameters) -> Json:
         if point.step in agreement:
             entry["agreement"] = agreement[point.step]
         free_error = free_errors.get(point.step, math.nan)
-        branch = compare_branches(point, free_error, noise_m, u_star)
+        branch = compare_branches(point, free_error, noise, u_star)
         return entry | ({} if branch is None else {"branch": branch})
 
     stop = recording.stop
@@ -416,12 +415,9 @@ def _compared_noise(noise: ChannelNoise, name: str) -> float:
 
     The error of both displacements of the mass is that of its motion relative to the table.
     """
-    rms = noise.channel_rms(name)
-    if name == "mass_disp_m" or math.isnan(rms):
-        lasers = ("mass_disp_m", "table_disp_m")
-        if name in ("rel_disp_m", "mass_disp_m"):
-            return math.hypot(*(noise.channel_rms(laser) for laser in lasers))
-    return rms
+    if name == "mass_disp_m":
+        return noise.laser_difference_rms
+    return noise.relative_displacement_rms if name == "rel_disp_m" else noise.channel_rms(name)
 
 
 def format_summary(summary: Json) -> str:

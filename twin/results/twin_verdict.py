@@ -35,7 +35,7 @@ import numpy as np
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
 from table_io.records import Agreement, Comparison, PrcPoint
-from twin.compare.curves import MIN_JUMP_RATIO, compare_amplitudes
+from twin.compare.curves import MIN_JUMP_RATIO
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
     GAP_ERROR_M,
@@ -43,7 +43,8 @@ from twin.compare.monitoring.agreement import (
     detect_contact,
     set_up_allowances,
 )
-from twin.compare.monitoring.jumps import JUMP_TOLERANCE
+from twin.compare.monitoring.cycle import ChannelNoise
+from twin.compare.monitoring.jumps import JUMP_TOLERANCE, measure_separation
 from twin.model.parameters import Parameters
 from twin.recording.reader import Recording
 from twin.results.quantities import format_quantity
@@ -204,7 +205,7 @@ def _summarise_step(
 
 
 def compare_branches(
-    point: PrcPoint, free_error: float, noise_m: float, u_star_m: float | None
+    point: PrcPoint, free_error: float, noise: ChannelNoise, u_star_m: float | None
 ) -> Json | None:
     """Return whether the free twin is on the branch of the specimen at a step; None if unknown.
 
@@ -214,9 +215,7 @@ def compare_branches(
     measured, twin = point.measured, point.twin
     if measured is None or twin is None or not u_star_m:
         return None
-    gap_error_m = GAP_ERROR_M if any((*measured.impacts_right, *measured.impacts_left)) else 0.0
-    noise_m = NOISE_FACTOR * noise_m if math.isfinite(noise_m) else 0.0
-    share = compare_amplitudes(measured, twin, (noise_m + gap_error_m) / u_star_m)
+    share = measure_separation(point, noise, u_star_m)
     if not math.isfinite(share):
         return None
     is_periodic = max(measured.spread, twin.spread) <= MAX_PERIODIC_SPREAD

@@ -71,7 +71,10 @@ def monitor_cycle(
     return after, [*agreement_records, *estimates, *attractor_events, *consistency_events]
 
 
-def monitor_step(state: MonitoringState, point: PrcPoint) -> tuple[MonitoringState, list[Record]]:
+def monitor_step(
+    state: MonitoringState, point: PrcPoint, u_star_m: float
+) -> tuple[MonitoringState, list[Record]]:
     """Update the state with a planned step of the sweep; return it with the new records."""
-    tracking, items = jumps.track_jumps(state.jump_tracking, point)
+    is_apart = jumps.measure_separation(point, state.noise, u_star_m) > 1
+    tracking, items = jumps.track_jumps(state.jump_tracking, point, is_apart)
     return replace(state, jump_tracking=tracking), items

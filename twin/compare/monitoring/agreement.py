@@ -147,9 +147,8 @@ def _sentence(cycle: CycleData, record: Agreement, shares: list[float]) -> str:
 
 def _min_band(setup: MonitoringSetup, noise: ChannelNoise, name: str) -> float:
     """Return the band of a compared channel without motion; NaN if its noise is unknown."""
-    rms = noise.channel_rms(name)
-    if name == "rel_disp_m" and np.isnan(rms):
-        rms = float(np.hypot(noise.channel_rms("mass_disp_m"), noise.channel_rms("table_disp_m")))
+    is_relative = name == "rel_disp_m"
+    rms = noise.relative_displacement_rms if is_relative else noise.channel_rms(name)
     if name.startswith("force"):
         return max(setup.contact_n, NOISE_FACTOR * rms) if rms > 0 else setup.contact_n
     return NOISE_FACTOR * rms if rms > 0 else float("nan")

@@ -72,6 +72,17 @@ class ChannelNoise:
             return float("nan")
         return float(self.rms[self.channels.index(name)])
 
+    @property
+    def relative_displacement_rms(self) -> float:
+        """Noise rms of u in m: of its own sensor, else of both lasers; NaN while unknown."""
+        rms = self.channel_rms("rel_disp_m")
+        return self.laser_difference_rms if np.isnan(rms) else rms
+
+    @property
+    def laser_difference_rms(self) -> float:
+        """Noise rms of the difference of the lasers of mass and table in m; NaN while unknown."""
+        return float(np.hypot(self.channel_rms("mass_disp_m"), self.channel_rms("table_disp_m")))
+
     def add_block(self, block: Block) -> "ChannelNoise":
         """Update with a block's samples at rest; independent of the division into blocks."""
         if self.is_known:

@@ -15,6 +15,8 @@ import numpy as np
 from table_io.config.profile import Profile
 from table_io.records import Event, JumpForecast, NormalizedResponse, PrcPoint, Record, Step
 from twin.compare.curves import compare_amplitudes, detect_hysteresis, find_sudden_change
+from twin.compare.monitoring.agreement import GAP_ERROR_M, NOISE_FACTOR
+from twin.compare.monitoring.cycle import ChannelNoise
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 
@@ -118,14 +120,32 @@ def _group_by_level(
     return [group for group in groups if group]
 
 
-def track_jumps(tracking: JumpTracking, point: PrcPoint) -> tuple[JumpTracking, list[Record]]:
+def measure_separation(point: PrcPoint, noise: ChannelNoise, u_star_m: float) -> float:
+    """Return how far the amplitudes of specimen and twin are apart at a step, over the tolerance.
+
+    Beyond 1 they are on different solutions; noise, if known, and gap errors where the bumpers are
+    touched belong to the tolerance. NaN without one of them.
+    """
+    measured, twin = point.measured, point.twin
+    if measured is None or twin is None:
+        return math.nan
+    allowance_m = GAP_ERROR_M if any((*measured.impacts_right, *measured.impacts_left)) else 0.0
+    noise_m = noise.relative_displacement_rms
+    if math.isfinite(noise_m):
+        allowance_m += NOISE_FACTOR * noise_m
+    return compare_amplitudes(measured, twin, allowance_m / u_star_m)
+
+
+def track_jumps(
+    tracking: JumpTracking, point: PrcPoint, is_apart: bool
+) -> tuple[JumpTracking, list[Record]]:
     """Update with a planned step; return jump Events and the forecast of the next jump.
 
-    On a grid finer than JUMP_TOLERANCE, a departure is reported only if the next step has it too.
+    `is_apart` tells whether specimen and twin are on different solutions there. On a grid finer
+    than JUMP_TOLERANCE, a departure is reported only if the next step has it too.
     """
     last, doubted = tracking.last_point, tracking.doubted
     items: list[Record] = []
-    is_apart = _are_apart(point)
     if doubted is not None and is_apart:
         items.append(replace(doubted, index=point.index))
     tracking = replace(tracking, last_point=point, doubted=None)
@@ -141,13 +161,6 @@ def track_jumps(tracking: JumpTracking, point: PrcPoint) -> tuple[JumpTracking, 
         else:
             items.append(event)
     return tracking, [*items, _forecast_jump(tracking.expected, point)]
-
-
-def _are_apart(point: PrcPoint) -> bool:
-    """Return whether specimen and twin are on different solutions."""
-    if point.measured is None or point.twin is None:
-        return False
-    return compare_amplitudes(point.measured, point.twin) > 1
 
 
 def _is_within_tolerance(last: PrcPoint, point: PrcPoint) -> bool:
