@@ -133,6 +133,18 @@ def test_the_worst_level_of_all_its_steps_is_told() -> None:
     merged = together(part(1, 0, 5), part(2, 4, 7, "complete"))
     assert merged["level_error"] == pytest.approx(0.007)
     assert (merged["level_error_hz"], merged["level_error_direction"]) == (1.0, "backward")
+    excitation = merged["excitation_verdict"]
+    assert (excitation["verdict"], excitation["worst_error"]) == ("reached", merged["level_error"])
+
+
+def test_the_excitation_of_a_merged_run_is_that_of_all_its_parts() -> None:
+    """Not that of the last one alone."""
+    parts = part(1, 0, 5), part(2, 4, 7, "complete")
+    first, second = summary(parts[0]), summary(parts[1])
+    first["steps"][1]["table_acc_fundamental_m_s2"] *= 1.3
+    second["excitation_verdict"] = {"verdict": "reached"}
+    merged = merge_summaries(run(*parts), PROFILE, [first, second])
+    assert merged["excitation_verdict"]["verdict"] == "missed"
 
 
 def test_curves_are_divided_by_what_free_flight_gave() -> None:

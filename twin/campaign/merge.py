@@ -5,7 +5,6 @@ the beginning of its direction.
 """
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict
 from itertools import groupby
@@ -14,7 +13,8 @@ from pathlib import Path
 from table_io.config.profile import Profile
 from twin.campaign.state import RunState
 from twin.compare.curves import detect_hysteresis
-from twin.results.summary import Json, number_or_nan, prc_points
+from twin.results.excitation_verdict import judge_excitation, list_level_errors
+from twin.results.summary import Json, prc_points
 from twin.results.twin_verdict import judge_twin
 
 NORMALIZED_BY_U_STAR, NORMALIZED_BY_A_STAR = (
@@ -38,7 +38,9 @@ def merge_summaries(run: RunState, profile: Profile, summaries: Sequence[Json]) 
     for part, summary in zip(run.parts, summaries, strict=True):
         for step in summary.get("steps") or ():
             steps[step["index"]] = {**step, "part": part.folder}
-    ordered = [steps[index] for index in sorted(steps)]
+    # Recordings of older versions do not state the demand.
+    level = {"demanded_m_s2": profile.plan.level_m_s2} if profile.steps else {}
+    ordered = [{**level, **steps[index]} for index in sorted(steps)]
     marks = {}
     for prefix, who in (("", "measured"), ("twin_", "twin")):
         jumps, intervals = detect_hysteresis(prc_points(ordered), who)
@@ -62,9 +64,10 @@ def merge_summaries(run: RunState, profile: Profile, summaries: Sequence[Json]) 
         "a_star_m_s2": last.get("a_star_m_s2"),
         "steps": ordered,
         **marks,
-        **_summarize_quality(profile, ordered, summaries),
+        **_summarize_quality(ordered, summaries),
         "warnings": [warning for summary in summaries for warning in summary.get("warnings", ())],
     }
+    merged["excitation_verdict"] = judge_excitation(merged, profile)
     return merged | {"twin_verdict": judge_twin(merged)}
 
 
@@ -92,17 +95,17 @@ def _describe_branch(run: RunState, profile: Profile, steps: list[Json], directi
     return {"direction": direction, "history": history, "broken_at_hz": broken, "pieces": pieces}
 
 
-def _summarize_quality(profile: Profile, steps: list[Json], summaries: Sequence[Json]) -> Json:
+def _summarize_quality(steps: list[Json], summaries: Sequence[Json]) -> Json:
     """Return quality figures of a run: level errors, checks, trips, faults, latency, gaps."""
-    demanded = profile.plan.level_m_s2 if steps else math.nan
-    errors = [number_or_nan(step["table_acc_fundamental_m_s2"]) / demanded - 1 for step in steps]
-    worst = max(range(len(steps)), key=lambda k: abs(errors[k]), default=None)
+    worst_error, worst = max(
+        list_level_errors(steps), key=lambda entry: abs(entry[0]), default=(None, None)
+    )
     levels = [step["level"] for step in steps if step.get("level")]
     latencies = [(summary.get("timing") or {}).get("latency_ms") or {} for summary in summaries]
     return {
-        "level_error": None if worst is None else errors[worst],
-        "level_error_hz": None if worst is None else steps[worst]["frequency_hz"],
-        "level_error_direction": None if worst is None else steps[worst]["direction"],
+        "level_error": worst_error,
+        "level_error_hz": None if worst is None else worst["frequency_hz"],
+        "level_error_direction": None if worst is None else worst["direction"],
         "level_error_uncorrected": max(
             (level["error_uncorrected"] for level in levels), key=abs, default=None
         ),

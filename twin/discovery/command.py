@@ -40,7 +40,7 @@ from twin.discovery.words import (
 )
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.quantities import format_quantity
-from twin.setup.folders import make_output_folder, make_run_folder
+from twin.setup.folders import make_output_folder, make_run_folder, remove_empty_folders
 from twin.system.progress import make_task_bar
 from twin.system.terminal import catch_interrupts, console, print_line, print_table
 
@@ -85,7 +85,7 @@ def run_discovery(
     try:
         result = _discover_with_progress(logs, model, without, held_out, options)
     except (InputError, Cancelled) as error:
-        folder.rmdir()  # leave no empty folder after a failure
+        remove_empty_folders()
         if isinstance(error, InputError):
             raise
         return None, EXIT_INTERRUPTED
@@ -269,13 +269,8 @@ def print_verdict(verdict: Verdict) -> None:
 def run_identification(logs: Sequence[PathLike], model: PathLike, out: Path | None) -> int:
     """Identify parameters from recordings; write a model file and a page; return the exit code."""
     target = _resolve_target(out)
-    try:
-        with console.status("reading") as status:
-            fitted = identify(logs, model, status.update)
-    except InputError:
-        if out is None:
-            target.parent.rmdir()  # leave no empty folder after a failure
-        raise
+    with console.status("reading") as status:
+        fitted = identify(logs, model, status.update)
     folder = make_output_folder(target.with_suffix(""), "")
     fitted.save_model(target)
     (folder / "identify.json").write_text(fitted.report.to_json(), encoding="utf-8")
@@ -405,11 +400,7 @@ def run_feature_search(
             if progress.text:
                 print_line(progress.text)
 
-        try:
-            result = discover_features(features, model, without, show, is_stopping)
-        except InputError:
-            folder.rmdir()
-            raise
+        result = discover_features(features, model, without, show, is_stopping)
     result.write(folder)
     write_features_page(folder, result)
     print_features(result.verdict)

@@ -7,7 +7,7 @@ required spectrum is met.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from table_io.config.profile import Profile
@@ -24,12 +24,7 @@ def judge_excitation(summary: Mapping[str, Any], profile: Profile) -> Json:
         return _state("not judged", "no table was driven")
     if summary.get("tracking"):
         return _judge_record(summary["tracking"], profile)
-    errors = [
-        (step["table_acc_fundamental_m_s2"] / step["demanded_m_s2"] - 1.0, step)
-        for step in summary["steps"]
-        if step.get("demanded_m_s2") and step["table_acc_fundamental_m_s2"] is not None
-    ]
-    known = [(error, step) for error, step in errors if math.isfinite(error)]
+    known = list_level_errors(summary["steps"])
     if not known:
         return _state("not judged", "the level of no step is known")
     tolerance = profile.protection.alarm
@@ -41,6 +36,16 @@ def judge_excitation(summary: Mapping[str, Any], profile: Profile) -> Json:
         reason = f"level off by more than {100 * tolerance:g} % at {outside} of {len(known)} steps"
         reason += f", worst {place}"
     return _state("missed" if outside else "reached", reason, outside, error)
+
+
+def list_level_errors(steps: Iterable[Json]) -> list[tuple[float, Json]]:
+    """Return the relative error of the level with each step of a summary where it is known."""
+    errors = [
+        (step["table_acc_fundamental_m_s2"] / step["demanded_m_s2"] - 1.0, step)
+        for step in steps
+        if step.get("demanded_m_s2") and step["table_acc_fundamental_m_s2"] is not None
+    ]
+    return [(error, step) for error, step in errors if math.isfinite(error)]
 
 
 def _judge_record(tracking: Mapping[str, Any], profile: Profile) -> Json:
