@@ -1,14 +1,16 @@
 """Measured orbits of a continuation in summary and report, beside those of the plan."""
 
+import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from table_io.config.base import parse_toml
 from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
-from table_io.records import OrbitPoint, RunStop
+from table_io.records import OrbitPoint, RunStart, RunStop, Step
 from tests.model.reference import snm
 from tests.reports.recordings import start_record
 from twin.monitor.panels import draw_prc
@@ -19,6 +21,7 @@ from twin.recording.reader import read_recording
 from twin.report.report import write_report
 from twin.results.orbits import find_measured_folds, read_planned_branch
 from twin.results.summary import parse_toml_tables, summarise, write_summary
+from twin.system.progress import RunProgress
 from twin.transport.codec import decode_item, encode_item, topic_for
 from twin.viewer.plots import FrequencyCurves
 
@@ -62,10 +65,16 @@ def make_point(step: int, reason: str = "") -> OrbitPoint:
     )  # fmt: skip
 
 
+def make_start(profile_toml: str) -> RunStart:
+    """Return the start of a recording of three planned orbits."""
+    steps = tuple(Step(k, "forward", 3.0 + 0.1 * k, 0.49) for k in range(3))
+    return replace(start_record(), steps=steps, profile_toml=profile_toml)
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("orbits")
-    start = replace(start_record(), profile_toml=PROFILE.format(plan=make_plan().to_json()))
+    start = make_start(PROFILE.format(plan=make_plan().to_json()))
     points = [make_point(0), make_point(1), make_point(2, "the feedback is 0.5 % of the command")]
     write_items(path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
     summary = summarise(read_recording(path / "run.mcap"), snm())
@@ -86,6 +95,17 @@ def test_summary_has_each_orbit_with_its_feedback(folder):
         [orbit["multiplier"] for orbit in orbits], [np.nan, 4.123, np.nan], equal_nan=True
     )
     assert [orbit["multiplier_sd"] for orbit in orbits] == [None, 0.07, None]
+
+
+def test_progress_tells_measured_and_planned_orbits():
+    shown = io.StringIO()
+    show = RunProgress(Console(file=shown, width=200), 70, 100)
+    for point in (make_point(0), make_point(1, "the feedback is 0.5 % of the command")):
+        show(point)
+    first, second = shown.getvalue().splitlines()
+    assert first.startswith("  1/70   orbit 0: +-2.1 mm at 3.01 Hz")
+    assert second.startswith("  1/70   orbit 1")
+    assert second.endswith("not accepted: the feedback is 0.5 % of the command")
 
 
 def test_uncertainty_of_a_multiplier_survives_the_wire():
@@ -116,7 +136,7 @@ def test_report_shows_branch_and_table(folder):
 def test_report_of_a_backbone_shows_the_phase(tmp_path):
     plan = make_plan().model_copy(update={"condition": "phase"})
     profile = PROFILE.format(plan=plan.to_json()).replace('"continuation"', '"backbone"')
-    start = replace(start_record(), profile_toml=profile)
+    start = make_start(profile)
     points = [make_point(0), make_point(1), make_point(2)]
     write_items(tmp_path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
     summary = summarise(read_recording(tmp_path / "run.mcap"), snm())

@@ -156,7 +156,7 @@ def test_a_spectrum_beyond_the_sampling_rate_is_checked_as_far_as_it_goes(run: R
 
 def test_the_last_line_states_rms_pga_and_spectrum(run: Run) -> None:
     *_, summary = run
-    line = format_summary(summary)
+    line = format_summary(summary, 0)
     assert re.search(r"acceleration [\d.]+ % RMS off its target in [\d.]+ to [\d.]+ Hz", line)
     assert re.search(r"PGA [\d.]+ % of it", line)
     assert f"{summary['tracking']['sa_count']} SA within 10 %" in line

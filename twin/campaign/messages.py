@@ -50,7 +50,8 @@ def format_run_end(campaign: ActiveCampaign, run: PlannedRun) -> str:
     state, folder = campaign.run_state(run), campaign.folder
     summaries = [read_summary(folder / part.folder) for part in state.parts]
     merged = merge_summaries(state, run.bundle.profile, summaries)
-    text = f"{format_run_name(campaign, run)}: {format_summary(merged)}"
+    result = format_summary(merged, len(run.bundle.steps))
+    text = f"{format_run_name(campaign, run)}: {result}"
     return f"{text}; from {len(summaries)} recordings" if len(summaries) > 1 else text
 
 

@@ -35,8 +35,8 @@ def finalize_run(
         from twin.viewer.view import write_rrd
 
         write_rrd(recording, folder / "view.rrd")
-    message = f"test {summaries.format_summary(summary)} -> {folder / 'report.html'}"
-    print_line(message)
+    result = summaries.format_summary(summary, len(run_config.steps))
+    print_line(f"test {result} -> {folder / 'report.html'}")
     print_twin_verdict(summary, folder)
     if summary["verdict"] != "complete":
         return EXIT_ABORTED

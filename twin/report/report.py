@@ -157,24 +157,27 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
 
 
 def format_orbit_headline(
-    orbits: list[dict[str, Any]], is_backbone: bool, folds: Sequence[dict[str, Any]] = ()
+    orbits: list[dict[str, Any]],
+    planned: int,
+    is_backbone: bool,
+    folds: Sequence[dict[str, Any]] = (),
 ) -> str:
     """Format the headline of a continuation: orbits accepted, range, feedback and folds."""
     accepted = [orbit for orbit in orbits if orbit["accepted"]]
     if not accepted:
-        return f"{len(orbits)} orbits, none accepted."
+        return f"none of {planned} orbits measured."
     unstable = [orbit for orbit in accepted if not orbit["stable"]] or accepted
     frequencies = [orbit["frequency_hz"] for orbit in unstable]
     share = max(orbit["feedback_share"] for orbit in accepted)
     if is_backbone:
         return (
-            f"{len(accepted)} of {len(orbits)} points of the backbone measured, "
+            f"{len(accepted)} of {planned} points of the backbone measured, "
             f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
             f"{100 * share:.2g} % of the command."
         )
     turns = [f"; {fold['kind']} fold at {fold['frequency_hz']:.4f} Hz" for fold in folds]
     return (
-        f"{len(accepted)} of {len(orbits)} orbits measured, {len(unstable)} of them unstable from "
+        f"{len(accepted)} of {planned} orbits measured, {len(unstable)} of them unstable from "
         f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
         f"{100 * share:.2g} % of the command{''.join(turns)}."
     )
@@ -189,9 +192,13 @@ def format_headline(run: ReportData) -> str:
         tracking = run.summary.get("tracking")
         return f"{headline}; {format_tracking(tracking)}." if tracking else f"{headline}."
     if run.orbits:
-        planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
-        folds = run.summary.get("folds") or []
-        return format_orbit_headline(run.orbits, planned.get("kind") == "backbone", folds)
+        excitation = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
+        return format_orbit_headline(
+            run.orbits,
+            len(run.recording.start.steps),
+            excitation.get("kind") == "backbone",
+            run.summary.get("folds") or [],
+        )
     done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [

@@ -420,13 +420,13 @@ def _compared_noise(noise: ChannelNoise, name: str) -> float:
     return noise.relative_displacement_rms if name == "rel_disp_m" else noise.channel_rms(name)
 
 
-def format_summary(summary: Json) -> str:
-    """Format the result of a run in one line."""
+def format_summary(summary: Json, planned: int) -> str:
+    """Format the result of a run of `planned` steps or orbits in one line."""
     windows = summary.get("windows")
     orbits = summary.get("orbits")
     if orbits is not None:
         accepted = sum(orbit["accepted"] for orbit in orbits)
-        done = f"{accepted} of {len(orbits)} orbits measured"
+        done = f"{accepted} of {planned} orbits measured"
     else:
         done = f"{len(summary['steps'])} steps" if windows is None else f"{len(windows)} windows"
     parts = [f"{summary['verdict']}: {done}"]

@@ -20,6 +20,7 @@ from table_io.records import (
     Event,
     Fault,
     NormalizedResponse,
+    OrbitPoint,
     PrcPoint,
     Record,
     SampleGap,
@@ -55,6 +56,7 @@ class RunProgress:
     def __init__(self, console: Console, steps: int, samples: int) -> None:
         self._console = console
         self._steps = steps
+        self._orbits = 0  # accepted so far
         self._latency_ms: float | None = None
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
@@ -92,6 +94,8 @@ class RunProgress:
             self._latency_ms = item.p99_ms
         elif isinstance(item, PrcPoint):
             self._print_point(item)
+        elif isinstance(item, OrbitPoint):
+            self._print_orbit(item)
         elif isinstance(item, StepAdded):
             self._steps = max(self._steps, item.step + 1)
         elif isinstance(item, Event):
@@ -125,6 +129,12 @@ class RunProgress:
                 f"{'':>7}  gap: more samples of {name} {gap.reason}; the next are shown after "
                 f"{GAP_SERIES_SAMPLES} valid samples"
             )
+
+    def _print_orbit(self, orbit: OrbitPoint) -> None:
+        """Print how many of the planned orbits are measured, and the newest."""
+        self._orbits += orbit.accepted
+        message = format_record(orbit, 1.0)
+        self.print_line(f"{self._orbits:>3}/{self._steps:<3}  {message[1] if message else ''}")
 
     def _print_point(self, point: PrcPoint) -> None:
         if not self._header_printed:
