@@ -132,7 +132,7 @@ applied = [0.0, 1.0]
 """
 
 
-def test_a_calibration_record_that_came_in_between_is_told_and_the_campaign_goes_on(
+def test_campaign_warns_of_a_new_calibration_record_and_goes_on(
     tmp_path: Path,
 ) -> None:
     def plan(rig_toml: str) -> CampaignPlan:

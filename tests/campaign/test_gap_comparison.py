@@ -214,7 +214,7 @@ def test_a_channel_that_is_missing_gives_no_number() -> None:
     assert rank_gaps(comparison, "twin", "r") is not None
 
 
-def test_records_are_told_apart_by_their_motion(tmp_path: Path) -> None:
+def test_records_are_distinguished_by_their_motion(tmp_path: Path) -> None:
     write_grid(tmp_path)
 
     def make_profile(file: str, scale: float, gap_mm: float, **keys: Any) -> Profile:

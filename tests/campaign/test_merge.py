@@ -129,7 +129,7 @@ def test_a_branch_of_which_only_the_end_is_left_is_broken_too() -> None:
     ]
 
 
-def test_the_worst_level_of_all_its_steps_is_told() -> None:
+def test_merged_level_is_the_worst_of_all_steps() -> None:
     merged = together(part(1, 0, 5), part(2, 4, 7, "complete"))
     assert merged["level_error"] == pytest.approx(0.007)
     assert (merged["level_error_hz"], merged["level_error_direction"]) == (1.0, "backward")
@@ -175,6 +175,6 @@ def test_what_is_not_known_stays_unknown() -> None:
     assert (impacts["frequency_hz"], impacts["right"]) == (1.0, pytest.approx(3.0))
 
 
-def test_a_run_without_a_recording_is_told_as_planned() -> None:
+def test_merge_without_a_recording_takes_the_planned_level() -> None:
     merged = merge_summaries(RunState(name="01-g4", label="g4"), PROFILE, [])
     assert (merged["verdict"], merged["steps"], merged["planned_steps"]) == ("planned", [], 8)

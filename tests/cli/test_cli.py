@@ -131,9 +131,8 @@ def test_a_log_that_is_none_is_refused(command: str, run_folder: Path, tmp_path:
     require_refusal(call_main(command, text, cwd=tmp_path), "not an MCAP file")
     require_refusal(call_main(command, foreign, cwd=tmp_path), "not a shaketwin log", "/camera")
     require_refusal(call_main(command, cut, cwd=tmp_path), str(cut))
-    require_refusal(
-        shaketwin(command, tmp_path / "none.mcap", cwd=tmp_path), "none.mcap", "No such file"
-    )
+    missing = call_main(command, tmp_path / "none.mcap", cwd=tmp_path)
+    require_refusal(missing, "none.mcap", "No such file")
     assert set(tmp_path.iterdir()) == files
 
 
@@ -149,7 +148,7 @@ def test_a_truncated_log_still_shows_its_curve(run_folder: Path, tmp_path: Path)
 
 
 def test_prc_says_the_numbers_of_the_summary(run_folder: Path) -> None:
-    result = shaketwin("prc", run_folder, "--json")
+    result = call_main("prc", run_folder, "--json")
     assert result.returncode == 0, result.stderr
     printed = json.loads(result.stdout)
     assert printed["steps"] == json.loads((run_folder / "summary.json").read_text())["steps"]
@@ -159,12 +158,14 @@ def test_prc_says_the_numbers_of_the_summary(run_folder: Path) -> None:
 
 
 def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> None:
-    command = [SHAKETWIN, "prc", str(run_folder)]
-    bare = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
-    narrow, file = (
-        subprocess.run(command, capture_output=True, text=True, check=True, env=env).stdout
-        for env in ({**bare, "COLUMNS": "40"}, bare)
-    )
+    narrow = subprocess.run(
+        [SHAKETWIN, "prc", str(run_folder)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "COLUMNS": "40"},
+    ).stdout
+    file = call_main("prc", run_folder).stdout
     assert max(map(len, narrow.splitlines()[:9])) <= 40
     assert "3.400" in narrow
     assert "impacts L" in file

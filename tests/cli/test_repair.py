@@ -37,7 +37,7 @@ def test_a_full_disk_leaves_no_half_of_a_file(
     assert examine_logs([new]).report.damage == []
 
 
-def test_what_failed_first_is_told(
+def test_repair_names_what_failed_first(
     old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Not what failed then, as the file was closed."""

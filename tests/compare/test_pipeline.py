@@ -374,7 +374,7 @@ def test_a_decided_step_has_its_cycles_and_its_point_but_no_leap(
     assert not of(items, Event)
 
 
-def test_it_does_not_matter_when_and_how_often_a_step_is_told_of(
+def test_comparison_does_not_depend_on_when_and_how_often_a_step_is_announced(
     first_only: pipeline.PipelineSetup, measured: Block, added_steps: list[StepAdded]
 ) -> None:
     at_once = run_pipeline(
@@ -396,7 +396,7 @@ def test_it_does_not_matter_when_and_how_often_a_step_is_told_of(
     assert records(one_by_one) == records(at_once)
 
 
-def test_a_step_that_nobody_told_of_is_passed_over(
+def test_step_that_was_not_announced_is_skipped(
     setup: pipeline.PipelineSetup, first_only: pipeline.PipelineSetup, measured: Block
 ) -> None:
     items = run_pipeline(first_only, [measured])

@@ -86,7 +86,7 @@ def test_captured_starts_end_where_full_length_runs_end(frequency, count):
     assert (basins.labels != full).mean() <= 0.002
 
 
-def test_mirror_images_are_told_apart():
+def test_mirror_images_are_distinguished():
     basins = compute_basins(at(1.5385), GRID)
     assert [a.period for a in basins.attractors] == [1, 1, 1, 1]
     for index, attractor in enumerate(basins.attractors):

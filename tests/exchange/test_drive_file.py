@@ -144,7 +144,7 @@ def test_the_simulated_controller_reads_it(
     assert np.abs(values - plan).max() < 1e-12
 
 
-def test_bad_input_is_told(profile: Path, tmp_path: Path) -> None:
+def test_export_drive_refuses_bad_input(profile: Path, tmp_path: Path) -> None:
     path = export_file(profile, tmp_path, "drive.csv")
     with raises_input_error(where=f"-o {path}"):
         export_drive(DriveOptions(profile, path))

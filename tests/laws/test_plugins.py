@@ -228,7 +228,7 @@ LAW = laboratory_laws.ZENER_BUMPER
         (replace(LAW, parameters=LAW.parameters[1:]), "parameters", "vanish"),
     ],
 )  # fmt: skip
-def test_a_law_that_cannot_work_is_told_why(effect, key, words):
+def test_law_that_cannot_work_is_refused_with_the_reason(effect, key, words):
     check_effect(LAW)
     with pytest.raises(InputError) as caught:
         check_effect(effect)

@@ -252,7 +252,7 @@ def test_the_model_that_is_left_says_how_well_its_numbers_are_known(
     assert low < card.base.stiffness_n_m < high
 
 
-def test_logs_that_are_called_alike_are_told_apart(tmp_path: Path) -> None:
+def test_logs_of_the_same_name_are_distinguished(tmp_path: Path) -> None:
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "log.mcap").touch()
     for folder in ("a/run", "b/run"):
@@ -388,7 +388,7 @@ def test_laws_are_typeset(term: str, typeset: str) -> None:
      (2e300, 1e299, ["2.000·10^300", "1.900·10^300", "2.100·10^300"]),
      (3.0, 0.0, ["3.000", "3.000", "3.000"])],
 )  # fmt: skip
-def test_an_interval_can_be_told_from_its_value(
+def test_interval_can_be_distinguished_from_its_value(
     value: float, half: float, texts: list[str]
 ) -> None:
     interval = Interval(value=value, low=value - half, high=value + half, unit="")

@@ -50,7 +50,7 @@ def test_numbers_are_those_of_the_summary(run_folder: Maker) -> None:
         assert number in text
 
 
-def test_jumps_and_hysteresis_are_told_and_the_verdict_stands_on_top(run_folder: Maker) -> None:
+def test_report_lists_jumps_and_hysteresis_below_the_verdict(run_folder: Maker) -> None:
     text = words(bare(run_folder()))
     assert "hysteresis right both 1.5 2" in text
     assert "jump 1 down forward 2 2.5" in text

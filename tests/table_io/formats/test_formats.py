@@ -1,11 +1,13 @@
 """Binary formats: one recording out of each of them, what is no column, and hostile files."""
 
 import os
+import random
 import re
 import signal
 import zipfile
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -21,6 +23,7 @@ from table_io.formats import read_table, sandbox
 from table_io.formats.table import ForeignTable
 from table_io.formats.words import normalize_unit
 from tests.input_errors import raises_input_error
+from tests.recording.mutants import damage
 from twin.exchange.columns import ColumnMap, ImportedSamples, read_samples
 
 h5py = pytest.importorskip("h5py")
@@ -374,6 +377,18 @@ def test_read_table_of_a_file_that_was_cut_off(tmp_path: Path, kind: str) -> Non
         return
     with pytest.raises(InputError, match=re.escape(path.name)):
         import_table(read_table(path, FORMATS[kind][2].get("group", "")), kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", FORMATS)
+def test_read_samples_reads_or_refuses_a_damaged_file(tmp_path: Path, kind: str) -> None:
+    make_table(tmp_path, kind)
+    path = tmp_path / FORMATS[kind][0]
+    sound = path.read_bytes()
+    for number in range(200):
+        path.write_bytes(damage(sound, random.Random(number)))
+        with suppress(InputError):
+            import_table(read_table(path, FORMATS[kind][2].get("group", "")), kind)
 
 
 def with_dataset(path: Path, **options: Any) -> None:
