@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
-from table_io.units import GRAVITY_M_S2
 from twin.campaign.gap_comparison import GapComparison
 from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
@@ -25,6 +24,7 @@ from twin.drawing.plot_style import (
     save_figures,
 )
 from twin.drawing.prc_families import draw_all_gaps, draw_transition
+from twin.results.excitation_verdict import list_level_errors
 from twin.results.measured_campaign import MeasuredCampaign
 from twin.results.paper_cases import PaperCase, PaperTest, name_gap
 from twin.results.report_data import DIRECTIONS
@@ -127,15 +127,14 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     ax = figure.subplots()
     band = 100 * max(run.profile.control.tolerance for run in campaign.runs)
     ax.axhspan(-band, band, color="#1a7f37", alpha=0.10, lw=0)
-    for run in list_swept_runs(campaign):
-        level = run.profile.sweep.one_level_g * GRAVITY_M_S2
-        for direction in DIRECTIONS:
-            direction_points = [
-                point for point in prc_points(run.summary["steps"]) if point.direction == direction
-            ]
-            f = np.array([point.frequency_hz for point in direction_points])
-            measured = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
-            ax.plot(f, 100 * (measured / level - 1), **_dot_style(direction))
+    errors = [
+        (step["direction"], step["frequency_hz"], 100 * error)
+        for run in list_swept_runs(campaign)
+        for error, step in list_level_errors(run.summary["steps"])
+    ]
+    for direction in DIRECTIONS:
+        own = [place for name, *place in errors if name == direction]
+        ax.plot(*np.reshape(own, (-1, 2)).T, **_dot_style(direction))
     ax.axhline(0, color=GUIDE_COLOUR, lw=0.8)
     low, high = ax.get_ylim()
     ax.set_ylim(min(low, -1.2 * band), max(high, 1.2 * band))

@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block
-from table_io.records import Level, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import Hysteresis
 from twin.drawing.branch_curves import FREE_QUANTITIES
@@ -330,37 +329,26 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
 
     The uncorrected level is the measured level divided by the correction.
     """
-    accepted = {level.step: level for level in run.recording.records(Level) if level.accepted}
-    points = [point for point in run.recording.records(PrcPoint) if point.step in accepted]
-    if not points:
+    steps = [step for step in run.steps if step.get("level") and step["level"]["accepted"]]
+    if not steps:
         return
-    demand = accepted[points[0].step].demanded_m_s2
     figure = Figure(figsize=(9.5, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     for direction in DIRECTIONS:
-        direction_points = [point for point in points if point.direction == direction]
-        if not direction_points:
+        own = sorted(
+            (step for step in steps if step["direction"] == direction),
+            key=lambda step: step["frequency_hz"],
+        )
+        if not own:
             continue
-        f = np.array([point.frequency_hz for point in direction_points])
-        reached = np.array([point.table_acc_fundamental_m_s2 for point in direction_points])
-        demanded = np.array([accepted[point.step].demanded_m_s2 for point in direction_points])
-        correction = np.array([accepted[point.step].correction for point in direction_points])
-        order = np.argsort(f)
-        colour = DIRECTION_COLOURS[direction]
-        error, uncorrected_error = (
-            100 * (reached / demanded - 1),
-            100 * (reached / correction / demanded - 1),
-        )
-        upper.plot(f[order], error[order], "o-", color=colour, ms=3, label=f"{direction}")
-        upper.plot(
-            f[order],
-            uncorrected_error[order],
-            ":",
-            color=colour,
-            lw=1.2,
-            label=f"{direction}, uncorrected",
-        )
-        lower.plot(f[order], correction[order], "o-", color=colour, ms=3)
+        f, colour = [step["frequency_hz"] for step in own], DIRECTION_COLOURS[direction]
+        for name, label, style in (
+            ("error", direction, {"ls": "-", "marker": "o", "ms": 3}),
+            ("error_uncorrected", f"{direction}, uncorrected", {"ls": ":", "lw": 1.2}),
+        ):
+            errors = [100 * step["level"][name] for step in own]
+            upper.plot(f, errors, color=colour, label=label, **style)
+        lower.plot(f, [step["level"]["correction"] for step in own], "o-", color=colour, ms=3)
     for tolerance_percent in (-2, 2):
         upper.axhline(tolerance_percent, color="#777777", lw=0.8, ls="--")
     upper.set_ylabel("level error in %")
@@ -371,7 +359,8 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
         "level",
         "Level of the table",
         f"Error of the fundamental of the measured table acceleration relative to the demanded "
-        f"{demand / GRAVITY_M_S2:.3g} g over the measured cycles of each step (dashed: ±2 %), the "
-        "same without correction of the command (dotted), and the correction factor.",
+        f"{steps[0]['level']['demanded_m_s2'] / GRAVITY_M_S2:.3g} g over the measured cycles of "
+        "each step (dashed: ±2 %), the same without correction of the command (dotted), and the "
+        "correction factor.",
         figure,
     )

@@ -30,6 +30,7 @@ from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.reader import Recording, read_recording
 from twin.report.figures import draw_run_figures
 from twin.results.contracts import SummaryKeys
+from twin.results.excitation_verdict import list_level_errors
 from twin.results.report_data import (
     ReportData,
     build_report_data,
@@ -78,6 +79,9 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
     texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
     motion_pictures = [picture for picture in pictures if picture.path.stem in MOTION_FIGURES]
     other_pictures = [picture for picture in pictures if picture not in motion_pictures]
+    demand = {step.index: step.acceleration_m_s2 for step in start.steps}
+    # Summaries of older versions do not state the demand.
+    steps = [{"demanded_m_s2": demand.get(step["index"]), **step} for step in run.steps]
     return render_page(
         Path(__file__).with_name("report.html"),
         run=run,
@@ -89,7 +93,8 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         images=embed_images(other_pictures),
         motion_images=embed_images(motion_pictures),
         format_required=format_required,
-        demand={step.index: step.acceleration_m_s2 for step in start.steps},
+        demand=demand,
+        level_errors={step["index"]: error for error, step in list_level_errors(steps)},
         texts=[
             (name, sha256(text.encode()).hexdigest(), _shorten(text))
             for name, text in texts.items()

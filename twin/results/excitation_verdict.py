@@ -43,7 +43,7 @@ def list_level_errors(steps: Iterable[Json]) -> list[tuple[float, Json]]:
     errors = [
         (step["table_acc_fundamental_m_s2"] / step["demanded_m_s2"] - 1.0, step)
         for step in steps
-        if step.get("demanded_m_s2") and step["table_acc_fundamental_m_s2"] is not None
+        if step.get("demanded_m_s2") and step.get("table_acc_fundamental_m_s2") is not None
     ]
     return [(error, step) for error, step in errors if math.isfinite(error)]
 
