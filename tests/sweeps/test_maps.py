@@ -244,10 +244,6 @@ def test_what_makes_no_model_is_refused(
          'minimise = ["peak_disp_m", "peak_acc_m_s2"]\neach = "gap"', {"key": "front.each"}),
         ('outcomes = ["folds"]\n[[parameters]]\nname = "effects.coulomb_friction.fc"\n'
          "values = [1.0, 2.0]", {"key": "outcomes", "value": "folds"}),
-        ('outcomes = ["discovery"]\n[[parameters]]\nname = "sweep.acceleration_g"\n'
-         "values = [0.02, 0.05]", {"key": "outcomes", "value": "discovery"}),
-        ('outcomes = ["discovery"]\n' + GAP + "values = [3.0, 4.0]\n[fixed]\n"
-         '"specimen.mass_kg" = 500.0', {"key": "outcomes", "value": "discovery"}),
         ('outcomes = ["peaks"]\n[[parameters]]\nname = "discovery.noise"\nvalues = [0.1, 0.2]',
          {"key": "discovery.noise"}),
         ('outcomes = ["peaks"]\nseed = 5000000000\n' + GAP + "values = [1.0, 2.0]",
@@ -466,15 +462,3 @@ def test_every_kind_of_study_has_a_page(tmp_path: Path, kind: str, is_partial: b
     assert ("sensitivity" in names) == (kind == "sensitivity")
     forces = open_study(out)["transmitted_force_n"]
     assert int(forces.notnull().sum()) == stored
-
-
-@pytest.mark.slow
-def test_discovery_names_a_large_friction_and_nothing_where_there_is_none() -> None:
-    study = Study.read(Path("discovery_power"))
-    arrays, failures = compute_outcomes(
-        study, np.array([[64.0, 0.01], [0.0, 0.01]]), make_seeds(1, range(2))
-    )
-    assert not failures
-    assert arrays["named_right"].tolist() == [1.0, 1.0]
-    assert arrays["named_wrong"].tolist() == [0.0, 0.0]
-    assert arrays["gap_closed"][0] > 0.9

@@ -45,7 +45,14 @@ def compute_outcomes(
         except InputError as error:
             failures[index] = str(error)
             cases.append(None)
-    chunk = CaseChunk(tuple(cases), tuple(seeds.tolist()), make_sweep_plan(study), failures)
+    chunk = CaseChunk(
+        tuple(cases),
+        tuple(seeds.tolist()),
+        make_sweep_plan(study),
+        failures,
+        study.profile_toml,
+        study.model_toml,
+    )
     arrays: dict[str, npt.NDArray[Any]] = {}
     for outcome in study.outcomes:
         arrays |= _compute_outcome(outcome, chunk)

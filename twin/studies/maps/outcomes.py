@@ -72,12 +72,15 @@ class CaseChunk:
 
     A case without a model, or whose computation fails, has NaN in all of it and its reason in
     `failures`, by its place in the chunk. `seeds`: of each case, for outcomes that draw numbers.
+    `profile_toml`, `model_toml`: the test and the model of the study.
     """
 
     cases: tuple[SampledCase | None, ...]
     seeds: tuple[int, ...]
     sweep: SweepPlan
     failures: dict[int, str] = field(default_factory=dict)
+    profile_toml: str = ""
+    model_toml: str = ""
 
     def for_each(self, compute: Callable[[int, SampledCase], Result]) -> list[Result | None]:
         """Return what `compute` returns for each place and case, None where it fails."""
@@ -190,8 +193,7 @@ class Outcome:
     `needs_both_directions`: of the sweep. `needs_closed_form`: of the model, whose effects then
     only change parameters. `settings`: further keys that a study may vary or fix, with their units;
     they begin with the name of the outcome, and are in `SampledCase.settings`; `required`: those
-    that a study must state. `keys`: how the keys begin on which it depends; empty for all. `test`:
-    what it computes in place of the model under the sweep.
+    that a study must state. `test`: what it computes in place of the model under the sweep.
     """
 
     name: str
@@ -202,7 +204,6 @@ class Outcome:
     needs_closed_form: bool = False
     settings: Mapping[str, str] = field(default_factory=dict)
     required: tuple[str, ...] = ()
-    keys: tuple[str, ...] = ()
     test: str = ""
 
 

@@ -150,15 +150,6 @@ class Study:
                         key=key,
                         remedy="add it to [fixed] or to the parameters",
                     )
-            for key in stated:
-                if outcome.keys and not key.startswith(outcome.keys):
-                    raise InputError(
-                        f"does not depend on {key}",
-                        key="outcomes",
-                        value=outcome.name,
-                        allowed=f"with parameters {', '.join(outcome.keys)}",
-                        remedy="leave out the outcome or the parameter",
-                    )
         front = self.config.front
         if front is None:
             return
