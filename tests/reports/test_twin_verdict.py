@@ -13,6 +13,7 @@ import pytest
 from table_io.block import Block
 from table_io.config.toml_text import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
+from tests.studies.blind.rig_setup import NOMINAL_RIG
 from twin.compare.monitoring.cycle import ChannelNoise
 from twin.recording.reader import read_recording
 from twin.results.summary import Json, summarise, write_summary
@@ -25,7 +26,6 @@ from twin.results.twin_verdict import (
 )
 from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced
-from twin.validation.study.rig_setup import NOMINAL_RIG
 
 TEST = """
 title = "{name}"

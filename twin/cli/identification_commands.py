@@ -1,6 +1,5 @@
-"""Commands `discover`, `identify` and `study`; they import slow modules only when run."""
+"""Commands `discover`, `identify` and `table-twin`; they import slow modules only when run."""
 
-import enum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,19 +16,7 @@ LogPaths = Annotated[
 ]
 
 
-class LawStudyRig(enum.StrEnum):
-    """Rigs of the study of laws."""
-
-    simulated = "simulated"
-    hydraulic = "hydraulic"
-
-
 identification_app = typer.Typer()
-study_app = typer.Typer(
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-    help="Score a method on blind cases with sealed ground truth.",
-)
 
 
 @identification_app.command("discover", rich_help_panel=LEARN_PANEL)
@@ -138,115 +125,3 @@ def identify_table_from_log(
     from twin.earthquakes.command import identify_table_command as command
 
     raise typer.Exit(command(logs, out, with_effects))
-
-
-identification_app.add_typer(study_app, name="study", rich_help_panel=LEARN_PANEL)
-
-
-StudyFolder = Annotated[
-    Path | None,
-    typer.Option("--out", help="New folder for the study, or an existing one with --resume."),
-]
-StudyWorkers = Annotated[
-    int | None, typer.Option("--workers", help="Processes; default: all cores.")
-]
-StudyResume = Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")]
-
-
-@study_app.callback()
-def _study_callback() -> None:
-    """Require the name of the command even though there is one only."""
-
-
-@study_app.command("discovery")
-def discovery_command(
-    out: StudyFolder = None,
-    seeds: Annotated[
-        int,
-        typer.Option(
-            "--seeds", help="Cases per cell; five times as many without effect and with pairs."
-        ),
-    ] = 10,
-    cells: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--cells",
-            help="Only these cells, such as 'single/*/3/1%', or a case number; repeatable.",
-        ),
-    ] = None,
-    workers: StudyWorkers = None,
-    scheduler: Annotated[
-        str, typer.Option("--scheduler", help="Address of a Dask scheduler whose workers compute.")
-    ] = "",
-    resume: StudyResume = False,
-    laboratory: Annotated[
-        str,
-        typer.Option(
-            "--laboratory",
-            help="Imperfections of instruments and set-up: none, typical, or one bad at a time.",
-        ),
-    ] = "none",
-    controls: Annotated[
-        bool,
-        typer.Option(
-            "--controls",
-            help="Also run negative controls: reversed time, effect removed from the library.",
-        ),
-    ] = False,
-) -> None:
-    """Score discovery on blind cases with sealed ground truth."""
-    from twin.validation.study.command import run_discovery_study as command
-
-    raise typer.Exit(
-        command(out, seeds, cells or [], workers, resume, controls, laboratory, scheduler)
-    )
-
-
-@study_app.command("decide")
-def decide_command(
-    out: StudyFolder = None,
-    seeds: Annotated[
-        int, typer.Option("--seeds", help="Cases per cell; five times as many of pairs.")
-    ] = 2,
-    cells: Annotated[
-        list[str] | None,
-        typer.Option("--cells", help="Only these cells, such as 'pair/*/1%'; repeatable."),
-    ] = None,
-    workers: StudyWorkers = None,
-    resume: StudyResume = False,
-    first: Annotated[
-        str,
-        typer.Option(
-            "--first", help="First test: sweep, or at one level: one-frequency, or flight."
-        ),
-    ] = "sweep",
-) -> None:
-    """Score the tests that `discover --decide` proposes, and random ones, on hidden plants."""
-    from twin.validation.study.decisive_runs import run_decide_study as command
-
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume, first))
-
-
-@study_app.command("laws")
-def laws_command(
-    out: StudyFolder = None,
-    seeds: Annotated[
-        int, typer.Option("--seeds", help="Cases per cell; five times as many without effect.")
-    ] = 1,
-    cells: Annotated[
-        list[str] | None,
-        typer.Option("--cells", help="Only these cells, such as 'unknown/*/3/1%'; repeatable."),
-    ] = None,
-    workers: StudyWorkers = None,
-    resume: StudyResume = False,
-    rig: Annotated[
-        LawStudyRig, typer.Option("--rig", help="Rig that records the hidden laws.")
-    ] = LawStudyRig.simulated,
-    rivals: Annotated[
-        bool, typer.Option("--rivals", help="Fit the installed baselines to the same recordings.")
-    ] = False,
-) -> None:
-    """Score the laws that a search proposes for hidden forces that no library holds."""
-    from twin.validation.study.law_study import run_law_study as command
-
-    raise typer.Exit(command(out, seeds, cells or [], workers, resume, rig.value, rivals))

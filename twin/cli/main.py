@@ -35,7 +35,7 @@ app = typer.Typer(
 
 COMPUTING_COMMANDS = frozenset({
     "branches", "campaign", "check", "compare", "demo", "discover", "explain", "identify", "import",
-    "map", "paper", "prc", "replay", "report", "run", "schema", "simulate", "study", "table-drive",
+    "map", "paper", "prc", "replay", "report", "run", "schema", "simulate", "table-drive",
     "table-twin", "verify", "view",
 })  # fmt: skip
 PLAN_PANEL, DRIVE_PANEL, LOOK_PANEL = (

@@ -121,7 +121,7 @@ CHAPTERS = (
             GuidePage("paper-gap", "The paper's own gap", write_paper_gap),
             _page("recording", "What a recording holds"),
             _page("inside", "How it is built"),
-            _page("study", "How good discovery is", "twin/validation/study/README.md"),
+            _page("how-good", "How good discovery is"),
             _page("glossary", "Glossary"),
         ),
     ),

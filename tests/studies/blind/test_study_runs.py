@@ -10,14 +10,13 @@ import pytest
 
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from tests.validation import study_work
-from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
+from tests.studies.blind import evaluation, study_work
+from tests.studies.blind.command import run_cases, run_discovery_study
+from tests.studies.blind.generation import CasePaths
+from tests.studies.blind.report import RESULTS_FILE, TABLE_FILE, read_rows
+from tests.studies.blind.strata import draw_case
+from tests.studies.blind.test_study_scores import OTHER, TRUE, about, verdict
 from twin.system.process_pool import Workers
-from twin.validation.study import evaluation
-from twin.validation.study.command import run_cases, run_discovery_study
-from twin.validation.study.generation import CasePaths
-from twin.validation.study.report import RESULTS_FILE, TABLE_FILE, read_rows
-from twin.validation.study.strata import draw_case
 
 Json = dict[str, Any]
 

@@ -3,7 +3,7 @@
 import os
 from typing import Any
 
-from twin.validation.study.scoring import score_verdict
+from tests.studies.blind.scoring import score_verdict
 
 CLEAN: dict[str, Any] = {
     "cell": "none/1%", "kind": "none", "noise": 0.01, "size": 0.0, "reached": 1.0,

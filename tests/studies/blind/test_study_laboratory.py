@@ -18,26 +18,23 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.ground_truth import GroundTruth, HiddenEffect
 from table_io.sim.imperfections import IMPERFECTION_IDS, Imperfection
 from table_io.sim.simulated_table import build_plant, hide_laws
-from tests.validation.test_study_scores import OTHER, TRUE, about, verdict
-from twin.recording.reader import read_recording
-from twin.setup.run_config import from_texts
-from twin.validation.study.command import run_discovery_study
-from twin.validation.study.generation import generate_case, play_unprotected
-from twin.validation.study.laboratory_report import compute_laboratory_metrics
-from twin.validation.study.laboratory_scores import (
+from tests.studies.blind.command import run_discovery_study
+from tests.studies.blind.generation import generate_case, play_unprotected
+from tests.studies.blind.laboratory_report import compute_laboratory_metrics
+from tests.studies.blind.laboratory_scores import (
     classify_finding,
     score_base,
     score_identification,
     score_laboratory,
 )
-from twin.validation.study.laboratory_truth import (
+from tests.studies.blind.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
     measure_reading_errors,
     measure_visible_size,
 )
-from twin.validation.study.report import METRICS_FILE, RESULTS_FILE, write_study_pages
-from twin.validation.study.rig_setup import (
+from tests.studies.blind.report import METRICS_FILE, RESULTS_FILE, write_study_pages
+from tests.studies.blind.rig_setup import (
     MODEL_TOML,
     PROFILE,
     PROFILE_TOML,
@@ -47,14 +44,17 @@ from twin.validation.study.rig_setup import (
     make_rig_toml,
     simulate_readings,
 )
-from twin.validation.study.scoring import score_verdict
-from twin.validation.study.strata import (
+from tests.studies.blind.scoring import score_verdict
+from tests.studies.blind.strata import (
     CELLS,
     NUMBERS_PER_CELL,
     Case,
     draw_case,
     list_case_numbers,
 )
+from tests.studies.blind.test_study_scores import OTHER, TRUE, about, verdict
+from twin.recording.reader import read_recording
+from twin.setup.run_config import from_texts
 
 Json = dict[str, Any]
 ERRORS = {

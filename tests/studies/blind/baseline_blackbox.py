@@ -10,8 +10,8 @@ import numpy as np
 from sklearn.ensemble import HistGradientBoostingRegressor
 
 from table_io.block import Float1D, Float2D
+from tests.studies.blind.baseline_terms import ForceRegression, RegressionProblem
 from twin.discovery.screening import FOLD_COUNT
-from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]
 DELAYS_S = (0.01, 0.03, 0.1, 0.3)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Float1D
+from tests.studies.blind.baseline_terms import ForceRegression, RegressionProblem
 from twin.discovery.screening import FOLD_COUNT
 from twin.discovery.symbolic_regression import fit_regressor
-from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]
 

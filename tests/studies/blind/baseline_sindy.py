@@ -14,8 +14,8 @@ import numpy as np
 from pysindy.optimizers import STLSQ
 
 from table_io.block import Bool2D, Float1D, Float2D
+from tests.studies.blind.baseline_terms import ForceRegression, RegressionProblem
 from twin.discovery.screening import FOLD_COUNT
-from twin.validation.study.baseline_terms import ForceRegression, RegressionProblem
 
 Json = dict[str, Any]
 THRESHOLDS = tuple(

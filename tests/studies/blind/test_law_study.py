@@ -8,7 +8,7 @@ import pytest
 
 from table_io.block import Label
 from tests.discovery.played import SNM
-from twin.validation.study.law_study import (
+from tests.studies.blind.law_study import (
     STEADY_CYCLES,
     STRONGER_TEST,
     UNUSED_TEST,
@@ -17,7 +17,7 @@ from twin.validation.study.law_study import (
     measure_curve_error,
     measure_force_error,
 )
-from twin.validation.study.rig_setup import PROFILE, make_rig_toml, simulate_signals
+from tests.studies.blind.rig_setup import PROFILE, make_rig_toml, simulate_signals
 
 NOISE = np.array([1.0, 1.0, 1.0])
 

@@ -25,6 +25,23 @@ from table_io.clock import RealClock, cpu_seconds
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
+from tests.studies.blind.adapter import load_case
+from tests.studies.blind.baselines import describe_missing, find_baselines
+from tests.studies.blind.command import open_study_folder, parse_cases, run_cases
+from tests.studies.blind.evaluation import run_method, select_case_facts
+from tests.studies.blind.generation import CasePaths, generate_case, hash_truth, record_test
+from tests.studies.blind.rates import Rate, select_latest
+from tests.studies.blind.report import RESULTS_FILE, read_rows
+from tests.studies.blind.rig_setup import (
+    PROFILE,
+    PROFILE_TOML,
+    StudySignals,
+    add_hydraulic_instruments,
+    make_hydraulic_rig_toml,
+    make_rig_toml,
+    simulate_signals,
+)
+from tests.studies.blind.strata import Case, draw_case
 from twin.discovery.discover import prepare_problem
 from twin.discovery.law_search import LawProposal, find_law_of_base
 from twin.discovery.law_terms import LAW_PREFIX
@@ -38,23 +55,6 @@ from twin.model.solver import OUTPUT_COUNT
 from twin.model.valid_range import find_range_exits
 from twin.system.process_pool import Workers
 from twin.system.terminal import print_line
-from twin.validation.study.adapter import load_case
-from twin.validation.study.baselines import describe_missing, find_baselines
-from twin.validation.study.command import open_study_folder, parse_cases, run_cases
-from twin.validation.study.evaluation import run_method, select_case_facts
-from twin.validation.study.generation import CasePaths, generate_case, hash_truth, record_test
-from twin.validation.study.rates import Rate, select_latest
-from twin.validation.study.report import RESULTS_FILE, read_rows
-from twin.validation.study.rig_setup import (
-    PROFILE,
-    PROFILE_TOML,
-    StudySignals,
-    add_hydraulic_instruments,
-    make_hydraulic_rig_toml,
-    make_rig_toml,
-    simulate_signals,
-)
-from twin.validation.study.strata import Case, draw_case
 
 Json = dict[str, Any]
 DEFAULT_DIR, TABLE_FILE = Path("runs") / "study-laws", "laws.md"

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
-from tests.validation.test_study_scores import about, verdict
-from twin.validation.study import baselines
-from twin.validation.study.baseline_terms import make_regression_problem
-from twin.validation.study.comparison_tables import format_baseline_table
-from twin.validation.study.scoring import score_verdict
+from tests.studies.blind import baselines
+from tests.studies.blind.baseline_terms import make_regression_problem
+from tests.studies.blind.comparison_tables import format_baseline_table
+from tests.studies.blind.scoring import score_verdict
+from tests.studies.blind.test_study_scores import about, verdict
 
 
 def test_without_the_packages_the_study_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,14 +43,14 @@ def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
     ],
 )
 def test_sparse_regression_names_what_the_state_makes(effect: str, values: Any) -> None:
-    sindy = pytest.importorskip("twin.validation.study.baseline_sindy", exc_type=ImportError)
+    sindy = pytest.importorskip("tests.studies.blind.baseline_sindy", exc_type=ImportError)
     fitted = sindy.select_terms(make_regression_problem(log(format_truth(effect, **values)), SNM))
     assert fitted["effects"][0]["id"] == effect
     assert fitted["gap"]["held_out_after"] < 0.7 * fitted["gap"]["held_out_before"]
 
 
 def test_boosted_trees_close_a_gap_that_has_no_name() -> None:
-    blackbox = pytest.importorskip("twin.validation.study.baseline_blackbox", exc_type=ImportError)
+    blackbox = pytest.importorskip("tests.studies.blind.baseline_blackbox", exc_type=ImportError)
     truth = format_truth("cubic_stiffness", k3=1e9)
     fitted = blackbox.fit_boosted_trees(make_regression_problem(log(truth), SNM))
     assert fitted["effects"] == []

@@ -8,28 +8,28 @@ from typing import Any, TextIO
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, suggest
-from twin.report.finalize import EXIT_INTERRUPTED
-from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
-from twin.system.process_pool import Task, Workers, run_tasks
-from twin.system.progress import make_task_bar
-from twin.system.terminal import catch_interrupts, print_line
-from twin.validation.study.baselines import describe_missing
-from twin.validation.study.comparison_tables import CONTROL_TITLES
-from twin.validation.study.controls import CONTROL_CELLS, run_controls
-from twin.validation.study.evaluation import evaluate_case
-from twin.validation.study.report import (
+from tests.studies.blind.baselines import describe_missing
+from tests.studies.blind.comparison_tables import CONTROL_TITLES
+from tests.studies.blind.controls import CONTROL_CELLS, run_controls
+from tests.studies.blind.evaluation import evaluate_case
+from tests.studies.blind.report import (
     CONTROLS_FILE,
     RESULTS_FILE,
     read_rows,
     verdict_label,
     write_study_pages,
 )
-from twin.validation.study.strata import (
+from tests.studies.blind.strata import (
     LABORATORY_LEVELS,
     LaboratoryLevel,
     draw_case,
     list_case_numbers,
 )
+from twin.report.finalize import EXIT_INTERRUPTED
+from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
+from twin.system.process_pool import Task, Workers, run_tasks
+from twin.system.progress import make_task_bar
+from twin.system.terminal import catch_interrupts, print_line
 
 Json = dict[str, Any]
 DEFAULT_DIR = Path("runs") / "study-discovery"

@@ -13,10 +13,8 @@ from table_io.block import Label
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, GroundTruth
-from twin.recording.reader import read_recording as read_log
-from twin.results.recordings import read_recorded_config
-from twin.validation.study import amplitude_search, generation, strata
-from twin.validation.study.amplitude_search import (
+from tests.studies.blind import amplitude_search, generation, strata
+from tests.studies.blind.amplitude_search import (
     BaselineResidual,
     apply_sensor_effect,
     evaluate_residual,
@@ -24,16 +22,18 @@ from twin.validation.study.amplitude_search import (
     max_share,
     scale_parameters,
 )
-from twin.validation.study.evaluation import evaluate_case
-from twin.validation.study.generation import CasePaths, generate_case
-from twin.validation.study.rig_setup import (
+from tests.studies.blind.evaluation import evaluate_case
+from tests.studies.blind.generation import CasePaths, generate_case
+from tests.studies.blind.rig_setup import (
     PROFILE,
     StudySignals,
     compute_noise_rms,
     make_rig_toml,
     simulate_signals,
 )
-from twin.validation.study.strata import CELLS, NUMBERS_PER_CELL, Case, draw_case, list_case_numbers
+from tests.studies.blind.strata import CELLS, NUMBERS_PER_CELL, Case, draw_case, list_case_numbers
+from twin.recording.reader import read_recording as read_log
+from twin.results.recordings import read_recorded_config
 
 
 def case_in(cell: str, place: int = 0) -> Case:

@@ -5,8 +5,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from twin.validation.study.adapter import load_case
-from twin.validation.study.baseline_terms import RegressionProblem, make_regression_problem
+from tests.studies.blind.adapter import load_case
+from tests.studies.blind.baseline_terms import RegressionProblem, make_regression_problem
 
 Json = dict[str, Any]
 # baseline: required package
@@ -18,21 +18,21 @@ MISSING_MESSAGE = (
 
 def run_sindy(case_dir: Path) -> Json:
     """Run PySINDy on the recording of a case; return the verdict."""
-    from twin.validation.study.baseline_sindy import select_terms
+    from tests.studies.blind.baseline_sindy import select_terms
 
     return select_terms(_load_problem(case_dir))
 
 
 def run_blackbox(case_dir: Path) -> Json:
     """Run boosted trees on the recording of a case; return a verdict with their error."""
-    from twin.validation.study.baseline_blackbox import fit_boosted_trees
+    from tests.studies.blind.baseline_blackbox import fit_boosted_trees
 
     return fit_boosted_trees(_load_problem(case_dir))
 
 
 def run_symbolic_regression(case_dir: Path) -> Json:
     """Run pyoperon on the recording of a case; return a verdict with its error."""
-    from twin.validation.study.baseline_symbolic import fit_expressions
+    from tests.studies.blind.baseline_symbolic import fit_expressions
 
     return fit_expressions(_load_problem(case_dir))
 

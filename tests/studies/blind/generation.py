@@ -26,22 +26,20 @@ from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.toml_text import format_toml
 from table_io.records import Record, RunStop
 from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
-from twin.recording.mcap_log import write_items
-from twin.setup.run_config import RunConfig, from_texts
-from twin.validation.study.amplitude_search import (
+from tests.studies.blind.amplitude_search import (
     BaselineResidual,
     apply_sensor_effect,
     evaluate_residual,
     find_share,
     scale_parameters,
 )
-from twin.validation.study.laboratory_truth import (
+from tests.studies.blind.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
     list_true_errors,
     measure_visible_size,
 )
-from twin.validation.study.rig_setup import (
+from tests.studies.blind.rig_setup import (
     MODEL_TOML,
     NOMINAL_RIG,
     PROFILE,
@@ -53,7 +51,9 @@ from twin.validation.study.rig_setup import (
     simulate_readings,
     simulate_signals,
 )
-from twin.validation.study.strata import Case, PlantedEffect
+from tests.studies.blind.strata import Case, PlantedEffect
+from twin.recording.mcap_log import write_items
+from twin.setup.run_config import RunConfig, from_texts
 
 TRUTH_DIGITS = 6  # significant digits of a number in the truth
 

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from twin.validation.study.rates import (
+from tests.studies.blind.rates import (
     Rate,
     StudyMetric,
     compute_rate,

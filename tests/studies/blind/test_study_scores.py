@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 from scipy.optimize import brentq
 
-from twin.validation.study.rates import Rate, compute_calibration, compute_metrics, select_usable
-from twin.validation.study.report import (
+from tests.studies.blind.rates import Rate, compute_calibration, compute_metrics, select_usable
+from tests.studies.blind.report import (
     CONFUSION_FILE,
     RESULTS_FILE,
     compute_confusion,
     write_study_pages,
 )
-from twin.validation.study.scoring import format_effect_name, score_verdict, select_worst_misses
+from tests.studies.blind.scoring import format_effect_name, score_verdict, select_worst_misses
 
 Json = dict[str, Any]
 REGION = {"frequency_hz": [2.0, 3.2], "phase": ["contact_right", "contact_left"]}

@@ -23,9 +23,9 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 from table_io.block import Bool2D, Float1D, Float2D
 from table_io.config.base import parse_toml
+from tests.studies.blind.rig_setup import MODEL_TOML, PROFILE, SIGNAL_CHANNELS, StudySignals
+from tests.studies.blind.strata import PlantedEffect
 from twin.model.config import ModelConfig
-from twin.validation.study.rig_setup import MODEL_TOML, PROFILE, SIGNAL_CHANNELS, StudySignals
-from twin.validation.study.strata import PlantedEffect
 
 BANDWIDTH_HZ = 225.0  # of the fit; discovery uses 500 Hz samples after a low pass
 Key = TypeVar("Key", float, str)

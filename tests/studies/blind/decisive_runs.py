@@ -19,6 +19,10 @@ import numpy as np
 from table_io.clock import cpu_seconds
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
+from tests.studies.blind.generation import find_shares, hash_truth, make_truth, record_test
+from tests.studies.blind.rates import Rate
+from tests.studies.blind.rig_setup import MODEL_TOML, PROFILE_TOML, make_rig_toml
+from tests.studies.blind.strata import Case, draw_case, list_case_numbers
 from twin.discovery.decisive_test import (
     CandidateTest,
     draw_random_test,
@@ -35,10 +39,6 @@ from twin.setup.folders import claim_folder, make_output_folder
 from twin.setup.run_config import read_model_template
 from twin.system.process_pool import Workers, run_tasks
 from twin.system.terminal import catch_interrupts, print_line
-from twin.validation.study.generation import find_shares, hash_truth, make_truth, record_test
-from twin.validation.study.rates import Rate
-from twin.validation.study.rig_setup import MODEL_TOML, PROFILE_TOML, make_rig_toml
-from twin.validation.study.strata import Case, draw_case, list_case_numbers
 
 Json = dict[str, Any]
 DEFAULT_CELLS = ("pair/*/1%", "pair/*/5%")

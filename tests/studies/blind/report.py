@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from twin.results.summary import dump_strict_json
-from twin.validation.study.comparison_tables import format_baseline_table, format_control_table
-from twin.validation.study.laboratory_report import (
+from tests.studies.blind.comparison_tables import format_baseline_table, format_control_table
+from tests.studies.blind.laboratory_report import (
     compute_laboratory_metrics,
     format_laboratory_tables,
 )
-from twin.validation.study.rates import (
+from tests.studies.blind.rates import (
     Rate,
     StudyMetric,
     compute_calibration,
@@ -23,7 +22,8 @@ from twin.validation.study.rates import (
     select_latest,
     select_usable,
 )
-from twin.validation.study.scoring import select_worst_misses
+from tests.studies.blind.scoring import select_worst_misses
+from twin.results.summary import dump_strict_json
 
 Json = dict[str, Any]
 RESULTS_FILE, CONTROLS_FILE = "results.jsonl", "controls.jsonl"
@@ -59,7 +59,7 @@ def write_study_pages(folder: Path) -> Path:
     usable_rows = [row for row in every_usable_row if not row.get("laboratory")]
     in_laboratory = [row for row in every_usable_row if row.get("laboratory")]
     if any(row["kind"] != "pair" for row in usable_rows):
-        from twin.validation.study.confusion_matrix import draw_confusion_matrix
+        from tests.studies.blind.confusion_matrix import draw_confusion_matrix
 
         draw_confusion_matrix(*compute_confusion(usable_rows), folder / CONFUSION_FILE)
     path = folder / TABLE_FILE

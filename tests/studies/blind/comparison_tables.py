@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from statistics import median
 from typing import Any
 
-from twin.validation.study.rates import Rate, compute_rate, select_latest
+from tests.studies.blind.rates import Rate, compute_rate, select_latest
 
 Json = Mapping[str, Any]
 DISCOVERY = "discovery"

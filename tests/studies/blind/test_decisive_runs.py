@@ -8,18 +8,18 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from tests.input_errors import raises_input_error
-from twin.discovery.discover import discover_effects
-from twin.discovery.loading import load_logs
-from twin.discovery.parameters import STIFFNESS, EffectKey
-from twin.setup.run_config import read_model_template
-from twin.validation.study.decisive_runs import (
+from tests.studies.blind.decisive_runs import (
     evaluate_decision,
     format_rates,
     run_decide_study,
 )
-from twin.validation.study.generation import record_test
-from twin.validation.study.rig_setup import PROFILE_TOML
-from twin.validation.study.strata import draw_case, list_case_numbers
+from tests.studies.blind.generation import record_test
+from tests.studies.blind.rig_setup import PROFILE_TOML
+from tests.studies.blind.strata import draw_case, list_case_numbers
+from twin.discovery.discover import discover_effects
+from twin.discovery.loading import load_logs
+from twin.discovery.parameters import STIFFNESS, EffectKey
+from twin.setup.run_config import read_model_template
 
 Json = dict[str, Any]
 

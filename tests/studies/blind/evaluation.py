@@ -7,17 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from table_io.clock import cpu_seconds
-from twin.results.summary import dump_strict_json
-from twin.validation.study.adapter import (
+from tests.studies.blind.adapter import (
     discover_in_case,
     fit_true_structure,
     identify_in_case,
 )
-from twin.validation.study.baselines import find_baselines
-from twin.validation.study.generation import CasePaths, generate_case
-from twin.validation.study.laboratory_scores import score_identification, score_laboratory
-from twin.validation.study.scoring import score_verdict
-from twin.validation.study.strata import draw_case
+from tests.studies.blind.baselines import find_baselines
+from tests.studies.blind.generation import CasePaths, generate_case
+from tests.studies.blind.laboratory_scores import score_identification, score_laboratory
+from tests.studies.blind.scoring import score_verdict
+from tests.studies.blind.strata import draw_case
+from twin.results.summary import dump_strict_json
 
 Json = dict[str, Any]
 Method = Callable[[Path], Json]  # folder of a case -> verdict as in verdict.json

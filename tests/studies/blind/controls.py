@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from tests.studies.blind.adapter import load_case
+from tests.studies.blind.comparison_tables import CONTROL_TITLES
+from tests.studies.blind.generation import generate_case
+from tests.studies.blind.scoring import format_effect_name
+from tests.studies.blind.strata import draw_case
 from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import PreparedLog, discover_effects
 from twin.discovery.signals import LogSignals
 from twin.model.model import Model
-from twin.validation.study.adapter import load_case
-from twin.validation.study.comparison_tables import CONTROL_TITLES
-from twin.validation.study.generation import generate_case
-from twin.validation.study.scoring import format_effect_name
-from twin.validation.study.strata import draw_case
 
 Json = dict[str, Any]
 Spectrum = npt.NDArray[np.complex128]

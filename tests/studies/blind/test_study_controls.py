@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
-from tests.validation import study_work
-from tests.validation.test_study_scores import about, verdict
+from tests.studies.blind import study_work
+from tests.studies.blind.command import run_cases
+from tests.studies.blind.comparison_tables import compute_shuffled_rates
+from tests.studies.blind.controls import discover_without, reverse_log, summarize_verdict
+from tests.studies.blind.report import CONTROLS_FILE, RESULTS_FILE, TABLE_FILE, write_study_pages
+from tests.studies.blind.scoring import score_verdict
+from tests.studies.blind.test_study_scores import about, verdict
 from twin.system.process_pool import Workers
-from twin.validation.study.command import run_cases
-from twin.validation.study.comparison_tables import compute_shuffled_rates
-from twin.validation.study.controls import discover_without, reverse_log, summarize_verdict
-from twin.validation.study.report import CONTROLS_FILE, RESULTS_FILE, TABLE_FILE, write_study_pages
-from twin.validation.study.scoring import score_verdict
 
 QUADRATIC = format_truth("quadratic_damping", c2=6e3)
 # Left out of every run of the test, for its length; the study itself leaves out nothing.
