@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from twin.dynamics.period_map import set_total_gap
 from twin.model import closed_form
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
@@ -17,7 +18,6 @@ from twin.model.parameters import Parameters
 from twin.model.prepare import prepare_solver
 from twin.model.solver import Solver
 from twin.model.stepped_sine import simulate_stepped_sine
-from twin.studies.cases import make_gap_variants
 from twin.system.files import count_cores
 from twin.system.process_pool import Workers, run_tasks
 
@@ -143,7 +143,7 @@ def test_sampled_driver_with_effects(benchmark, kind):
 def test_batch_on_all_cores(benchmark):
     up = np.arange(5, 51) / 10
     frequencies = np.concatenate([up, up[::-1]])
-    models = make_gap_variants(Model(G4), np.linspace(2e-3, 0.03, 64))
+    models = [set_total_gap(Model(G4), gap) for gap in np.linspace(2e-3, 0.03, 64)]
     sweep_models(models[:2], frequencies, count_cores())
     benchmark(sweep_models, models, frequencies, count_cores())
     if benchmark.stats is None:

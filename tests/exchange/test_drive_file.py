@@ -12,13 +12,13 @@ from scipy.io import loadmat, wavfile
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.config.folders import find_config
+from table_io.sim.machine.table import read_drive
 from tests.input_errors import raises_input_error
 from twin.exchange.drive_file import (
     WRITERS,
     DriveFile,
     DriveOptions,
     export_drive,
-    read_drive,
     write_drive,
 )
 from twin.rig.table import ExternalController, serve_table

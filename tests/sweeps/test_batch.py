@@ -2,12 +2,12 @@
 
 import json
 
+from twin.dynamics.period_map import set_total_gap
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.model.stepped_sine import simulate_stepped_sine
 from twin.setup.run_config import read_model
 from twin.studies.batch import Batch, read_batch, simulate_case
-from twin.studies.cases import make_gap_variants
 
 AG = 0.05 * 9.80665
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
@@ -26,7 +26,7 @@ measured_cycles = 2
 
 
 def test_a_gap_is_shared_by_both_sides() -> None:
-    models = make_gap_variants(Model(G4), [0.03, 0.01, -0.002])
+    models = [set_total_gap(Model(G4), gap) for gap in (0.03, 0.01, -0.002)]
     assert [m.parameters.gap_r for m in models] == [0.015, 0.005, -0.001]
     assert [m.parameters.gap_l for m in models] == [0.015, 0.005, -0.001]
 

@@ -16,12 +16,11 @@ from twin.drawing.branch_curves import BranchSet, make_axis
 from twin.dynamics.diagram import compute_diagram
 from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.main_branches import compute_resonance_map, follow_main_branches
-from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, find_parameter
+from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL, find_parameter, set_total_gap
 from twin.model.model import Model
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import RunConfig, make_run_id, read_run_config
 from twin.setup.warm_up import COMPILING_MESSAGE
-from twin.studies.cases import make_gap_variants
 from twin.system.files import count_cores
 from twin.system.terminal import announce_if_slow, console, print_line
 
@@ -56,7 +55,7 @@ def show_branches(request: BranchRequest) -> int:
     config = read_run_config(request.profile, None, request.model)
     model = config.model
     if request.gap is not None:
-        model = make_gap_variants(model, [request.gap / 1e3])[0]
+        model = set_total_gap(model, request.gap / 1e3)
     level = find_level(config, request)
     limits = find_limits(config, model, request)
     title, toml = config.profile.title, config.model_toml

@@ -205,6 +205,11 @@ def find_parameter(model: Model, name: str) -> float:
     return values[name]
 
 
+def set_total_gap(model: Model, gap_m: float) -> Model:
+    """Return the model at a total gap in m, half of it on each side."""
+    return Model(replace(model.base, gap_r=gap_m / 2, gap_l=gap_m / 2), model.effects)
+
+
 def change_parameter(model: Model, name: str, value: float) -> Model:
     """Return the model with another value of "gap" (total, m) or of a name of `Model.flatten`.
 

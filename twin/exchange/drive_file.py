@@ -1,4 +1,4 @@
-"""Task `drive`: export of the planned drive as a file for another controller, and its reader.
+"""Task `drive`: export of the planned drive as a file for another controller, .
 
     csv  header line, after comments with unit, rate and hash
     txt  time in s and displacement in mm, separated by a tab, without header
@@ -23,8 +23,6 @@ import numpy as np
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.errors import InputError
-from table_io.formats import read_table
-from table_io.formats.timing import measure_rate
 from twin.setup.run_config import read_run_config
 
 CSV_HEADER = "time_s,drive_disp_mm"
@@ -236,25 +234,3 @@ FORMAT_BY_SUFFIX = {
     ".rsp": "rpc", ".tim": "rpc", ".uff": "uff", ".unv": "uff", ".u58": "uff", ".mat": "mat",
     ".wav": "wav",
 }  # fmt: skip
-
-
-def read_drive(path: Path) -> tuple[Float1D, float]:
-    """Return (displacement in m, (sample,), rate in Hz) of a csv or txt drive file.
-
-    For the simulated controller: a real one reads the file itself. Raises InputError if the file is
-    not a drive.
-    """
-    try:
-        table = read_table(path)
-        times, values = (table.read_column(name) for name in table.columns)
-        if not np.isfinite([times, values]).all():
-            raise ValueError("it has values that are no numbers")
-        rate_hz = round(measure_rate(times, table), 3)
-    except ValueError as error:  # InputError, or another number of columns
-        raise InputError(
-            f"no drive file ({error})",
-            where=f"--play {path}",
-            allowed="two columns, rising time in s and displacement in mm",
-            remedy="make one: shaketwin drive PROFILE -o FILE.csv",
-        ) from None
-    return values * 1e-3, rate_hz

@@ -1,13 +1,14 @@
 """Cases of a batch: every requested model at every requested gap."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from table_io.config.folders import find_config
 from table_io.config.profile import Profile, Specimen
 from table_io.errors import InputError
+from twin.dynamics.period_map import set_total_gap
 from twin.model.config import ModelConfig
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
@@ -156,7 +157,7 @@ def _models_at_gaps(
         model = config.build_model(specimen)
         if not gaps:
             return [(round(1e3 * sum(specimen.gaps_m), 9), model)]
-        return list(zip(gaps, make_gap_variants(model, [gap / 1e3 for gap in gaps]), strict=True))
+        return [(gap, set_total_gap(model, gap / 1e3)) for gap in gaps]
     except InputError as error:
         raise error.add_place(context) from None
 
@@ -173,10 +174,3 @@ def _require_simulable(case: StudyCase, profile: Profile, context: str) -> None:
         simulate_sweep(model, [slowest_hz], 0.0, 1)
     except InputError as error:
         raise error.add_place(f"{context}: {case.name}") from None
-
-
-def make_gap_variants(model: Model, gaps_m: Iterable[float]) -> list[Model]:
-    """Return the model at other total gaps in m, half of each gap per side."""
-    return [
-        Model(replace(model.base, gap_r=gap / 2, gap_l=gap / 2), model.effects) for gap in gaps_m
-    ]

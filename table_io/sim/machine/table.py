@@ -40,6 +40,8 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import REINSTALL, OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
 from table_io.errors import InputError
+from table_io.formats import read_table
+from table_io.formats.timing import measure_rate
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.simulated_table import SimulatedBackend
@@ -356,6 +358,28 @@ class PlaybackPlan:
     rate_hz: float
     ppm: float = 0.0
     after_s: float = 5.0  # after a client starts to acquire
+
+
+def read_drive(path: Path) -> tuple[Float1D, float]:
+    """Return (displacement in m, (sample,), rate in Hz) of a csv or txt drive file.
+
+    For the simulated controller: a real one reads the file itself. Raises InputError if the file is
+    not a drive.
+    """
+    try:
+        table = read_table(path)
+        times, values = (table.read_column(name) for name in table.columns)
+        if not np.isfinite([times, values]).all():
+            raise ValueError("it has values that are no numbers")
+        rate_hz = round(measure_rate(times, table), 3)
+    except ValueError as error:  # InputError, or another number of columns
+        raise InputError(
+            f"no drive file ({error})",
+            where=f"--play {path}",
+            allowed="two columns, rising time in s and displacement in mm",
+            remedy="make one: shaketwin drive PROFILE -o FILE.csv",
+        ) from None
+    return values * 1e-3, rate_hz
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
