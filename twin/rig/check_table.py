@@ -5,9 +5,7 @@ The output is started only if the readback of the command is at 0 V already, and
 """
 
 import contextlib
-import select
 import statistics
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, TypeGuard
@@ -24,13 +22,11 @@ from table_io.backends import (
     open_source,
 )
 from table_io.block import Float2D
-from table_io.clock import Clock, ManualClock, RealClock, local_datetime
+from table_io.clock import Clock, local_datetime
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import find_overdue_calibrations
-from table_io.config.folders import find_config
 from table_io.config.profile import AcquisitionConfig, Profile
 from table_io.config.rig import RigConfig
-from table_io.config.rig_file import load_rig
 from table_io.safety.wiring_check import (
     CheckLine,
     RestingInputs,
@@ -48,7 +44,6 @@ from table_io.safety.wiring_check import (
 )
 
 EXIT_FAILED = 2
-CHECK_PRIORITY = 50  # as for a rig: the machine's watchdog acts on a silent client
 TARE_S, REST_S, BLOCK_S = 1.0, 4.0, 0.02
 # Phases of a stimulus by hand: see `_record_response`.
 SETTLE_S, PRE_TRIGGER_S, STIMULUS_TIMEOUT_S, POST_TRIGGER_S = 1.0, 0.4, 30.0, 0.8
@@ -83,26 +78,6 @@ class WiringCheckResult:
     @property
     def has_passed(self) -> bool:
         return all(line.verdict != "fail" for line in self.lines)
-
-
-def check_wiring(table: str, unattended: bool, as_json: bool) -> int:
-    """Check the wiring and print the result; return 0, or 2 if a line fails."""
-    from twin.live.process_config import request_realtime
-    from twin.rig.wiring_table import print_wiring_result
-    from twin.system.terminal import print_line
-
-    rig, _ = load_rig(find_config(table, "rigs", option="--table"))
-    clock: Clock = ManualClock() if rig.runs_at_any_speed else RealClock()
-    has_operator = sys.stdin.isatty() and not (unattended or as_json or rig.runs_at_any_speed)
-    if not as_json:
-        print_line(f"{rig.title}: at rest, for {TARE_S + REST_S:g} s; keep away from the table")
-    if not rig.runs_at_any_speed:
-        request_realtime(CHECK_PRIORITY)
-    result = examine_wiring(
-        rig, clock, make_machine(rig, clock), has_operator and TerminalOperator()
-    )
-    print_wiring_result(result, as_json)
-    return 0 if result.has_passed else EXIT_FAILED
 
 
 def make_machine(rig: RigConfig, clock: Clock) -> Backend | AcquisitionSource:
@@ -281,15 +256,3 @@ def _record_response(
         first_kept = max(pre_trigger_samples, volts.shape[1] - history_samples)
         volts = np.concatenate([volts[:, :pre_trigger_samples], volts[:, first_kept:]], axis=1)
     return None
-
-
-class TerminalOperator:
-    """Operator at this terminal."""
-
-    def ask(self, what: str) -> None:
-        from twin.system.terminal import print_line
-
-        print_line(f"now: {what} (Enter: skip)")
-
-    def declines(self) -> bool:
-        return bool(select.select([sys.stdin], [], [], 0.0)[0]) and bool(sys.stdin.readline())
