@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from twin.cli import main
+from twin.cli import table as cli
 
 
 def call_main(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
@@ -16,10 +16,10 @@ def call_main(*words: object, cwd: Path | None = None) -> subprocess.CompletedPr
     argv, out, err = ["shaketwin", *map(str, words)], StringIO(), StringIO()
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
         patch.setattr(sys, "argv", argv)
-        patch.setattr(main, "configure_logging", lambda _: None)  # it would outlive the test
+        patch.setattr(cli, "configure_logging", lambda _: None)  # it would outlive the test
         if cwd is not None:
             patch.chdir(cwd)
         with pytest.raises(SystemExit) as ended:
-            main.main()
+            cli.main()
     assert isinstance(ended.value.code, int)
     return subprocess.CompletedProcess(argv, ended.value.code, out.getvalue(), err.getvalue())

@@ -20,7 +20,7 @@ for module, names in (os, ("fork", "killpg", "nice", "sched_getaffinity", "setpr
 ):
     for name in names:
         delattr(module, name)
-from twin.cli.main import main
+from twin.cli.table import main
 codes = []
 for line in sys.argv[1:]:
     sys.argv = ["shaketwin", *line.split()]
@@ -30,7 +30,7 @@ for line in sys.argv[1:]:
         codes.append(ended.code)
 print("codes", *codes)
 import twin.log, twin.discovery.command
-import twin.cli.simulate, twin.demo.command
+import twin.simulation.command, twin.demo.command
 import twin.campaign.report, twin.exchange.import_table, twin.monitor.app, twin.studies.command
 """
 

@@ -34,10 +34,10 @@ from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import LARGER, SMALLER, list_gap_tables, list_gap_values
 from twin.campaign.summary import read_campaign
-from twin.cli.simulate import simulate_profile
 from twin.drawing.page import render_page
 from twin.recording.reader import read_recording
 from twin.setup.run_config import RunConfig
+from twin.simulation.command import simulate_profile
 
 Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665

@@ -19,8 +19,8 @@ from twin.campaign import report, state
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.figures import prc_families
 from twin.campaign.summary import read_campaign
-from twin.cli import report as reading
 from twin.drawing.prc_families import draw_all_gaps
+from twin.inspection import command as reading
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
 from twin.setup.unpaced import play_unpaced

@@ -22,7 +22,7 @@ from table_io.config.sensor import CalibrationRecord
 from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.input_errors import raises_input_error
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.rig import calibrate as command
 from twin.setup.run_config import read_run_config
 

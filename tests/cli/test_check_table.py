@@ -21,7 +21,7 @@ from table_io.config.rig import RigConfig
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.flight_records import read_flight_record
 from tests.input_errors import raises_input_error
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.rig.check_table import WiringCheckResult, examine_wiring
 
 TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")

@@ -11,12 +11,9 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
-from typer.core import TyperGroup
-from typer.main import get_command
 
 from tests.command_line import call_main
-from twin.cli import main
-from twin.cli.main import app
+from twin.cli import table as cli
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 ROOT = Path(__file__).resolve().parents[2]
@@ -175,7 +172,7 @@ def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> N
 @pytest.mark.parametrize(
     ("module", "slow"),
     [
-        ("twin.cli.main", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
+        ("twin.cli.table", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
         ("twin.guide.reference_command", "numba scipy matplotlib zenoh"),
         ("twin.live.control", "typer numpy numba pydantic rich google.protobuf ssl"),
     ],
@@ -195,24 +192,13 @@ def test_help_and_a_stop_order_are_quick(module: str, slow: str) -> None:
 def test_only_a_report_imports_what_draws_and_scipy_signal_is_for_discovery() -> None:
     code = (
         "import sys; slow = {'matplotlib', 'scipy.signal'}; "
-        "import twin.cli.report; print(sorted(slow & set(sys.modules))); "
+        "import twin.inspection.command; print(sorted(slow & set(sys.modules))); "
         "import twin.report.report; print(sorted(slow & set(sys.modules)))"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.split("\n") == ["[]", "['matplotlib']", ""]
-
-
-def test_export_and_replay_say_steps_in_the_same_words() -> None:
-    group = get_command(app)
-    assert isinstance(group, TyperGroup)
-    options = []
-    for name in ("export", "replay"):
-        (option,) = (param for param in group.commands[name].params if param.name == "steps")
-        options.append((option.metavar, getattr(option, "help", None)))
-    assert options[0] == options[1]
-    assert options[0][0] == "FIRST:LAST"
 
 
 @pytest.mark.parametrize(("command", "kept"), [("run", True), ("campaign", True), ("prc", False)])
@@ -222,10 +208,10 @@ def test_only_what_records_says_that_the_recording_is_kept(
     def full() -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(main, "app", full)
+    monkeypatch.setattr(cli, "app", full)
     monkeypatch.setattr(sys, "argv", ["shaketwin", command, "x"])
     with pytest.raises(SystemExit, match="2"):
-        main.main()
+        cli.main()
     message = capsys.readouterr().err
     assert "No space left on device" in message
     assert ("the recording is kept" in message) == kept

@@ -20,8 +20,9 @@ from typer.testing import CliRunner
 from table_io.clock import local_datetime
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from twin.cli import credential_commands
-from twin.cli.credentials import (
+from twin import options
+from twin.rig import keys
+from twin.rig.keys import (
     add_person,
     create_keys,
     list_keys,
@@ -128,7 +129,7 @@ def test_an_expired_authority_is_named_as_such(
     lab: Path, monkeypatch: pytest.MonkeyPatch, late: timedelta
 ) -> None:
     ends = certificate_validity((lab / "ca.pem").read_bytes())[1]
-    monkeypatch.setattr("twin.cli.credentials.local_datetime", lambda: ends + late)
+    monkeypatch.setattr("twin.rig.keys.local_datetime", lambda: ends + late)
     before = contents(lab)
     for change in (
         lambda: add_person(lab, "bob", "observe", []),
@@ -234,7 +235,7 @@ def test_renewed_keys_replace_the_old_for_the_same_hosts_and_authority(lab: Path
 
 
 def test_the_roles_are_the_same_everywhere(lab: Path) -> None:
-    assert tuple(credential_commands.Role) == ROLES
+    assert tuple(keys.Role) == ROLES
     for role in ROLES:
         (lab / "access.toml").write_text(f'[people]\nanna = "{role}"\n')
         assert read_people(lab) == {"anna": role}
@@ -269,7 +270,7 @@ def test_the_list_says_who_may_what_and_until_when(
     assert {"(authority)", "(rig)"} <= rows.keys()
     for later, says in ((366 - EXPIRY_WARNING_DAYS, "days left"), (400, "EXPIRED")):
         at = local_datetime() + timedelta(days=later)
-        monkeypatch.setattr("twin.cli.credentials.local_datetime", lambda at=at: at)
+        monkeypatch.setattr("twin.rig.keys.local_datetime", lambda at=at: at)
         list_keys(lab)
         assert says in capsys.readouterr().out
         monkeypatch.undo()
@@ -279,21 +280,21 @@ def test_keys_that_expire_soon_say_so(
     lab: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     capsys.readouterr()
-    assert credential_commands.read_keys_option(None) is None
-    assert credential_commands.read_keys_option(lab, rig=True) is not None
+    assert options.read_keys_option(None) is None
+    assert options.read_keys_option(lab, rig=True) is not None
     assert capsys.readouterr().out == ""
     monkeypatch.setattr(
         "twin.security.credentials.local_datetime", lambda: local_datetime() + timedelta(days=360)
     )
-    credential_commands.read_keys_option(lab / "people" / "anna")
+    options.read_keys_option(lab / "people" / "anna")
     assert "expires in 4 days" in capsys.readouterr().out
     with raises_input_error(key="--keys", value=str(lab / "people" / "anna"), remedy="access.toml"):
-        credential_commands.read_keys_option(lab / "people" / "anna", rig=True)
+        options.read_keys_option(lab / "people" / "anna", rig=True)
 
 
 def test_the_commands(tmp_path: Path) -> None:
     app = typer.Typer()
-    app.add_typer(credential_commands.keys_app, name="keys")
+    app.add_typer(keys.keys_app, name="keys")
     folder = str(tmp_path / "lab")
 
     def run(*words: str) -> str:
@@ -315,8 +316,8 @@ def test_the_commands(tmp_path: Path) -> None:
 
 def test_the_commands_of_the_page_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     app = typer.Typer()
-    app.add_typer(credential_commands.keys_app, name="keys")
-    page = (Path(credential_commands.__file__).parents[1] / "security" / "KEYS.md").read_text()
+    app.add_typer(keys.keys_app, name="keys")
+    page = (Path(keys.__file__).parents[1] / "security" / "KEYS.md").read_text()
     lines = [line for line in page.splitlines() if line.startswith("shaketwin keys")]
     assert len(lines) == 7
     monkeypatch.chdir(tmp_path)

@@ -175,7 +175,7 @@ def test_a_rig_without_the_stroke_gets_no_proposal(plain: Path, tmp_path: Path) 
 
 def test_options_without_a_proposal_are_refused(tmp_path: Path) -> None:
     assert parse_options(None, False, "", 10.0, False, "realtime") is None
-    with raises_input_error(key="--rig", remedy="--decide"):
+    with raises_input_error(key="--table", remedy="--decide"):
         parse_options(None, False, "simulated", 10.0, False, "realtime")
     with raises_input_error(key="--speed", allowed="realtime or max"):
         parse_options(None, True, "", 10.0, False, "fast")

@@ -24,7 +24,7 @@ from table_io.config import folders
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.rig import devices as command
 
 MACHINE = (PROFILES_DIR / "rigs" / "machine.toml").read_text(encoding="utf-8")

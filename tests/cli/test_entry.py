@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from twin.cli import entry
-from twin.cli.live_commands import RunCommand
-from twin.cli.main import announce_first_start
+from twin.cli.table import announce_first_start
 from twin.live import control
+from twin.live.cli import RunCommand
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 SENT = [

@@ -57,7 +57,7 @@ def test_what_is_wrong_is_said_before_anything_listens(
 
 def test_a_run_without_its_table_says_how_to_start_it_and_leaves_nothing(tmp_path: Path) -> None:
     profile, rig = PROFILES_DIR / "tests" / "quickstart.toml", str(card(tmp_path))
-    with raises_input_error(remedy="shaketwin table --rig"):
+    with raises_input_error(remedy="shaketwin table --table"):
         run_test(profile, tmp_path / "out", False, None, rig, False, "tcp/127.0.0.1:7447")
     with pytest.raises(InputError) as raised:
         run_test(profile, tmp_path / "out", True, None, rig, False, "tcp/127.0.0.1:7447")

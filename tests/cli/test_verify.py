@@ -23,7 +23,7 @@ from table_io.records import RunStart, RunStop, SampleGap
 from tests.cli.test_cli import SHORT
 from tests.input_errors import raises_input_error
 from tests.recording.mutants import damage, spans, whole
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.recording.mcap_log import LogWriter, write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.recovery import ATTACHMENT, CHUNK, recover_log

@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
 from tests.recording.example_run import BLOCK_SAMPLES, START, block, run, write
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
 from twin.recording.reader import read_recording

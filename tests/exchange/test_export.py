@@ -17,7 +17,7 @@ from table_io.records import RunStop, StepAdded
 from tests.exchange.exported import LABEL_FIELDS, LOST, export_formats, measured
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.exchange.columns import read_samples
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.labels import read_labels

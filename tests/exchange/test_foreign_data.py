@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from table_io.block import Float1D
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.exchange import import_table
 from twin.recording.reader import read_recording
 

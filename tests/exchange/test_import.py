@@ -12,9 +12,9 @@ from table_io.records import Comparison, Event, PrcPoint, SampleGap
 from tests.exchange.csv_tables import write_csv
 from tests.input_errors import raises_input_error
 from tests.setup.test_unpaced import QUICK, play_run
-from twin.cli.report import print_recording_prc
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import ImportOptions, import_table
+from twin.inspection.command import print_recording_prc
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.results.recordings import read_recorded_config

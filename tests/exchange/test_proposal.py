@@ -10,7 +10,7 @@ from table_io.block import Float1D, Label
 from table_io.errors import InputError
 from table_io.formats.table import ForeignTable, make_column
 from tests.input_errors import raises_input_error
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.exchange.proposal import MapProposal, propose_map
 from twin.recording.reader import read_recording

@@ -11,7 +11,7 @@ from table_io.config.base import PROFILES_DIR, ConfigModel, load_config
 from table_io.config.key_reference import derive_unit, describe_tables
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from twin.cli.main import app
+from twin.cli.table import COMMANDS, app
 from twin.discovery.features.config import FeatureSet
 from twin.discovery.features.prediction import describe_feature
 from twin.discovery.result import FeatureVerdict
@@ -22,6 +22,8 @@ from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
 from twin.laws.effect import Effect
 from twin.laws.library import EFFECTS
+
+PROGRAM: Any = typer.main.get_command(app)
 
 
 def test_every_key_of_every_file_has_a_meaning() -> None:
@@ -76,15 +78,14 @@ def test_the_unit_of_a_key_is_its_longest_ending() -> None:
 
 
 def test_the_pages_list_every_key_and_command() -> None:
-    keys = write_key_reference(app)
+    keys = write_key_reference(PROGRAM)
     for _, _, model in CONFIG_FILES:
         for key in model.list_keys():
             assert key in keys
-    commands = write_command_reference(app)
-    program: Any = typer.main.get_command(app)
-    for name, command in program.commands.items():
+    commands = write_command_reference(PROGRAM)
+    for command in COMMANDS:
         if not command.hidden:
-            assert f"### shaketwin {name}" in commands
+            assert f"### shaketwin {command.name}" in commands
     assert "### shaketwin keys add" in commands
     assert "| `--remote-twin` |" in commands
 
@@ -110,7 +111,7 @@ def test_a_notebook_becomes_a_page_with_its_outputs() -> None:
 
 
 def test_the_gallery_has_every_effect_and_what_it_is_confused_with() -> None:
-    gallery = write_gallery(app)
+    gallery = write_gallery(PROGRAM)
     for effect in EFFECTS:
         section = gallery.partition(f"\n## {effect.id}\n")[2].partition("\n## ")[0]
         assert effect.residual in section

@@ -6,6 +6,7 @@ import sys
 from collections import Counter
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -13,12 +14,13 @@ from typer.main import get_command
 
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.guide.markdown import render_markdown
 from twin.guide.reference import PACKAGES_DIR
 from twin.guide.site import CHAPTERS, Chapter, GuidePage, build_guide
 
 ROOT = Path(__file__).resolve().parents[2]
+PROGRAM: Any = get_command(app)
 FILE_NAME = re.compile(r"^(?:\.github|profiles|table_io|tests|twin)/[\w./-]+\.\w+$")
 
 
@@ -56,7 +58,7 @@ class PageParser(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return build_guide(tmp_path_factory.mktemp("guide"), app).parent
+    return build_guide(tmp_path_factory.mktemp("guide"), PROGRAM).parent
 
 
 @pytest.fixture(scope="module")
@@ -109,9 +111,8 @@ def test_every_file_that_the_guide_names_exists(pages: dict[str, PageParser]) ->
 def test_every_command_that_the_guide_names_exists(pages: dict[str, PageParser]) -> None:
     lines = [line for page in pages.values() for code in page.codes for line in code.splitlines()]
     names = {match[1] for line in lines if (match := re.match(r"shaketwin ([a-z]+)\b", line))}
-    commands = getattr(get_command(app), "commands")  # noqa: B009
     assert len(names) > 20
-    assert names - commands.keys() == set()
+    assert names - PROGRAM.commands.keys() == set()
 
 
 def test_no_text_is_taken_for_a_tag(pages: dict[str, PageParser]) -> None:
@@ -124,7 +125,7 @@ def test_the_build_refuses_links_that_lead_nowhere(tmp_path: Path) -> None:
     (tmp_path / "a.md").write_text("# A\n[x](b.md) [y](#nowhere) [z](#a)")
     chapters = (Chapter("Start", (GuidePage("a", "A", tmp_path / "a.md"),)),)
     with raises_input_error(where="guide") as caught:
-        build_guide(tmp_path / "site", app, chapters)
+        build_guide(tmp_path / "site", PROGRAM, chapters)
     assert [fault.value for fault in caught.value.faults] == ["b.md", "a.html#nowhere"]
 
 
@@ -133,12 +134,12 @@ def test_only_a_guide_is_replaced(tmp_path: Path) -> None:
     text.write_text("# A")
     chapters = (Chapter("Start", (GuidePage("index", "A", text),)),)
     folder = tmp_path / "site"
-    first = build_guide(folder, app, chapters)
+    first = build_guide(folder, PROGRAM, chapters)
     text.write_text("# B")
-    assert "B</h1>" in build_guide(folder, app, chapters).read_text()
+    assert "B</h1>" in build_guide(folder, PROGRAM, chapters).read_text()
     first.write_text("mine")
     with raises_input_error(key="--out", value=str(folder)):
-        build_guide(folder, app, chapters)
+        build_guide(folder, PROGRAM, chapters)
     assert first.read_text() == "mine"
 
 

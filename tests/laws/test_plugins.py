@@ -312,7 +312,7 @@ def test_commands_take_it(package, tmp_path):
         + "parameters = { k1 = 8e3, tau = 0.05 }\n"
     )
     code = (
-        f"import sys; sys.path.insert(0, {str(package)!r}); from twin.cli.main import main; "
+        f"import sys; sys.path.insert(0, {str(package)!r}); from twin.cli.table import main; "
         f"sys.exit(main())"
     )
     profile = tmp_path / "short.toml"

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from tests.live.namespaces import HERE, cable
-from twin.cli.credentials import add_person, create_keys
+from twin.rig.keys import add_person, create_keys
 from twin.security.credentials import read_credentials
 from twin.transport.endpoint import MEAS_TOPIC, PUBLIC_HUB_SETTINGS
 from twin.transport.zenoh_link import open_hub

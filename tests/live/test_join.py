@@ -153,6 +153,6 @@ def test_invalid_run_id_of_a_peer_names_no_folder(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     where = gate(run=run)
-    with raises_input_error(key="endpoint", value=where, problem=RIG, remedy="--rig"):
+    with raises_input_error(key="endpoint", value=where, problem=RIG, remedy="--table"):
         join_as_recorder(where, RIG, None, None)
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ from tests.builders.ports import free_port
 from tests.live.test_live import QUICK, finish, kill, read_until, start
 from tests.monitor.browser import Browser, open_browser
 from tests.security.laboratory import laboratory
-from twin.cli.credentials import issue_code
+from twin.rig.keys import issue_code
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("drafts")]
 TEST = QUICK.replace("cycles = 5", "cycles = 8", 1)

@@ -21,7 +21,6 @@ from table_io.clock import local_datetime
 from tests.builders.ports import free_port
 from tests.input_errors import raises_input_error
 from tests.security.laboratory import RIG, RUN, door, laboratory, own
-from twin.cli.credentials import issue_code, remove_person, renew_keys
 from twin.monitor import page_server
 from twin.monitor.page_server import (
     PAGE_FILES,
@@ -38,6 +37,7 @@ from twin.monitor.web import (
     format_page_url,
     submit_page_command,
 )
+from twin.rig.keys import issue_code, remove_person, renew_keys
 from twin.security import page_access
 from twin.security.access_control import user_name
 from twin.security.credentials import read_credentials

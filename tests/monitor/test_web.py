@@ -21,7 +21,7 @@ from tests.monitor.monitored import point, records
 from tests.monitor.test_app import hub_at, publish
 from tests.monitor.test_page_server import PATIENCE_S, as_person, new_code, read_event
 from tests.security.laboratory import RIG, RUN, door, laboratory
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.live.run_command import run_test
 from twin.monitor import web
 from twin.monitor.web import PageRequestConfig, serve_page, start_page_process

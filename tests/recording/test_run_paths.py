@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from table_io.errors import InputError
-from twin.cli.report import print_recording_prc
+from twin.inspection.command import print_recording_prc
 from twin.recording.run_paths import resolve_log_path
 
 

@@ -12,7 +12,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.toml_text import format_toml
 from table_io.records import RunStop
 from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
 from twin.results.quantities import format_quantity

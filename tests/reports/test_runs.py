@@ -12,7 +12,7 @@ from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.reports.folders import make
 from tests.reports.recordings import summary
-from twin.cli.run_path import parse_run_path
+from twin.options import parse_run_path
 from twin.report.compare_command import _load_run
 from twin.report.run_comparison import compare_summaries
 from twin.report.run_index import (

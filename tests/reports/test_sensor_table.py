@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.recording.reader import read_recording
 from twin.results.sensor_table import build_sensor_rows
 

@@ -12,8 +12,8 @@ from typing import Any
 import zenoh
 
 from table_io.clock import local_datetime
-from twin.cli.credentials import add_person, create_keys, remove_person
 from twin.live.gateway import validate_command
+from twin.rig.keys import add_person, create_keys, remove_person
 from twin.security.access_control import ZenohSettings
 from twin.security.certificate_authority import CertificateKeyPair, issue_certificate
 from twin.security.credentials import read_credentials

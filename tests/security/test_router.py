@@ -23,7 +23,7 @@ from tests.security.laboratory import (
     own,
 )
 from tests.security.laboratory import person as raw_person
-from twin.cli.credentials import add_person, print_router_settings
+from twin.rig.keys import add_person, print_router_settings
 from twin.security.credentials import read_credentials
 from twin.transport.zenoh_link import BusLink, open_spoke
 

@@ -15,7 +15,7 @@ from table_io.formats import read_table
 from table_io.records import Comparison
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.viewer.example_run import scalars
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.compare import COMPARED_CHANNELS
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.log import open_log

@@ -13,7 +13,6 @@ from rich.console import Console
 from table_io.block import join_blocks
 from table_io.records import Event
 from twin.campaign.simulate_grid import simulate_peaks
-from twin.cli.simulate import simulate_profile
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.model.stepped_sine import SteppedSineResponse
@@ -26,6 +25,7 @@ from twin.results.summary import summarise
 from twin.rig.check import print_plan
 from twin.setup.run_config import read_model, read_run_config
 from twin.setup.unpaced import simulate_ideal
+from twin.simulation.command import simulate_profile
 from twin.system.progress import RunProgress
 
 PROFILE = """

@@ -19,7 +19,6 @@ from table_io.config.base import PROFILES_DIR
 from table_io.records import Check, Event, Level, PrcPoint, RunStop, Trip
 from tests.replay.in_memory import recorded_in
 from tests.table_io.excitation.pulse_train import PulseTrain
-from twin.cli.simulate import simulate_profile
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import import_table
 from twin.live.run_command import run_test
@@ -28,6 +27,7 @@ from twin.replay.pipeline_replay import replay_recording
 from twin.results.summary import summarise
 from twin.setup.run_config import RunConfig, from_texts, read_run_config
 from twin.setup.unpaced import play_unpaced
+from twin.simulation.command import simulate_profile
 from twin.transport.codec import Item
 
 RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()

@@ -162,7 +162,7 @@ def call_command(
     Wrong is a traceback, another exit code than those of the contract, and a refusal whose message
     has none of `names` in it.
     """
-    from twin.cli import main
+    from twin.cli import table as cli
     from twin.report import report as reports
 
     kept, argv = reports.write_report, sys.argv
@@ -173,7 +173,7 @@ def call_command(
     message = io.StringIO()
     try:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(message):
-            main.main()
+            cli.main()
     except SystemExit as end:
         code = end.code or 0
     except BaseException:
@@ -188,10 +188,10 @@ def call_command(
 
 def work(first: int, last: int) -> None:
     """Mutants first to last - 1 in this process, a line before and after each."""
-    from twin.cli import main
+    from twin.cli import table as cli
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
-    vars(main)["app"] = get_command(main.app)  # built once, not for each of thousands of calls
+    vars(cli)["app"] = get_command(cli.app)  # built once, not for each of thousands of calls
     with TemporaryDirectory() as folder:
         trials = Trials(Path(folder))
         for number in range(first, last):

@@ -36,7 +36,7 @@ from scipy.signal import resample_poly
 
 from table_io.block import Float1D
 
-SHAKETWIN = (sys.executable, "-c", "from twin.cli.main import main; main()")
+SHAKETWIN = (sys.executable, "-c", "from twin.cli.table import main; main()")
 INCH_M, KIP_N = 0.0254, 4448.2216152605
 MR_RUNS = tuple(f"ensaio{number}.1" for number in range(1, 10))  # one current, falling amplitude
 MR_MAP = """

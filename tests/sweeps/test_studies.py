@@ -18,13 +18,13 @@ import pytest
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
 from tests.input_errors import raises_input_error
-from twin.cli.report import write_folder_report
-from twin.cli.simulate import simulate_profile
+from twin.inspection.command import write_folder_report
 from twin.laws.effect import Effect, EffectParameter
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_model
+from twin.simulation.command import simulate_profile
 from twin.studies import figures
 from twin.studies.cases import parse_gaps_mm
 from twin.studies.rows import COLUMNS, read_batch_rows

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from tests.input_errors import raises_input_error
 from tests.reports.folders import BARE, COARSE
-from twin.cli.main import app
+from twin.cli.table import app
 from twin.drawing import plot_style
 from twin.paper import command
 from twin.paper.findings import count_onsets_per_cycle, find_bands

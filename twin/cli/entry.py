@@ -10,6 +10,7 @@ from table_io.errors import InputError
 from twin.system.resource_limits import MIN_MEMORY_BYTES, require_memory
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
+FORMER_TABLE_OPTION = "--rig"
 ORDERS = ("hold", "resume", "stop", "abort")
 NO_MEMORY_MESSAGE = "not enough memory: close other programs, or raise the limit `ulimit -v`"
 
@@ -42,7 +43,7 @@ def run_words(words: Sequence[str]) -> None:
         print(f"shaketwin: {error}", file=sys.stderr)
         raise SystemExit(2) from None
     if not was_order:
-        from twin.cli.main import main as run_command_line
+        from twin.cli.table import main as run_command_line
 
         run_command_line()
 
@@ -95,13 +96,14 @@ def prepare_streams() -> list[SteadyOutput]:
 
 
 def send_order(words: Sequence[str]) -> bool:
-    """Send `control ORDER [--why TEXT] [--connect ENDPOINT] [--rig NAME]`.
+    """Send `control ORDER [--why TEXT] [--connect ENDPOINT] [--table NAME]`.
 
     Return False for everything else, which the command line parses: help, keys, mistakes. Parsing
     it there too takes 0.2 s, most of it imports.
     """
-    options = {"--why": "", "--connect": DEFAULT_ENDPOINT, "--rig": "simulated"}
-    names, values = words[2::2], words[3::2]
+    options = {"--why": "", "--connect": DEFAULT_ENDPOINT, "--table": "simulated"}
+    names = ["--table" if name == FORMER_TABLE_OPTION else name for name in words[2::2]]
+    values = words[3::2]
     if words[:1] != ["control"] or not set(words[1:2]) & set(ORDERS):
         return False
     if len(names) != len(values) or not set(names) <= options.keys():
@@ -109,5 +111,5 @@ def send_order(words: Sequence[str]) -> bool:
     from twin.live.control import send_command
 
     options |= dict(zip(names, values, strict=True))
-    print(send_command(words[1], options["--why"], options["--connect"], options["--rig"]))
+    print(send_command(words[1], options["--why"], options["--connect"], options["--table"]))
     return True

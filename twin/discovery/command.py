@@ -60,7 +60,7 @@ def parse_options(
         if rig or yes:
             raise InputError(
                 "concerns the tests that are proposed",
-                key="--rig" if rig else "--yes",
+                key="--table" if rig else "--yes",
                 remedy="give --decide or --run, too",
             )
         return None

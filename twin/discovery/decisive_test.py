@@ -289,7 +289,7 @@ def read_recorded_test(paths: Sequence[Path], options: DecideOptions) -> tuple[R
 
 def load_named_rig(rig: str) -> str:
     """Return the text of a rig file by its name or path."""
-    return load_rig(find_config(rig, "rigs", option="--rig"))[1]
+    return load_rig(find_config(rig, "rigs", option="--table"))[1]
 
 
 def propose_tests(

@@ -131,7 +131,7 @@ class ImportColumns:
                     f"{name!r} is not a channel; {suggest(name, self.names)}",
                     where="column map",
                     key="columns",
-                    remedy="other channels are declared by [[channels]] in a rig file, see --rig",
+                    remedy="other channels are declared by [[channels]] in a rig file, see --table",
                 )
             allowed = self.unit_factors(name)
             if column.unit and column.unit not in allowed:
@@ -270,7 +270,7 @@ def _select_columns(
                 where=table.path,
                 remedy="`import FILE` without -o proposes a map; or map the columns with --columns "
                 "MAP (others are left out), or declare it by [[channels]] in a rig file and give "
-                "that by --rig",
+                "that by --table",
             )
         else:
             left_out.append(name)

@@ -16,6 +16,7 @@ from twin.exchange.drive_file import RPC_PEAK, DriveOptions, export_drive
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import ImportOptions, import_table, propose_import
 from twin.exchange.proposal import MapProposal
+from twin.recording.tabular import parse_step_range
 from twin.report.finalize import EXIT_GAPS
 from twin.system.progress import RunProgress
 from twin.system.terminal import console, error_console, print_line, print_table
@@ -80,8 +81,12 @@ def list_contents(files: Sequence[Path], out: Path | None, options: ImportOption
             print_line(line)
 
 
-def run_export(options: ExportOptions) -> None:
+def run_export(
+    log: Path, formats: Sequence[str], out: Path | None, channels: Sequence[str], steps: str | None
+) -> None:
     """Export a log and print the new files."""
+    span = None if steps is None else parse_step_range(steps)
+    options = ExportOptions(log, tuple(formats), out, tuple(channels), span)
     exported = export_log(options)
     if not exported.is_intact:
         warning = (
@@ -95,9 +100,9 @@ def run_export(options: ExportOptions) -> None:
         print_line(f"{size}{path}")
 
 
-def run_drive(options: DriveOptions) -> None:
+def run_drive(profile: Path, out: Path, table: str | None, file_format: str) -> None:
     """Export the drive of a test, and print what the file holds."""
-    exported = export_drive(options)
+    exported = export_drive(DriveOptions(profile, out, table, file_format))
     drive = exported.drive
     size = drive.values_m.size
     print_line(
@@ -184,7 +189,7 @@ def _format_command(files: Sequence[Path], options: ImportOptions, more: Sequenc
     if options.profile is not None:
         words += ["--profile", str(options.profile)]
     if options.rig is not None:
-        words += ["--rig", options.rig]
+        words += ["--table", options.rig]
     return shlex.join([*words, *_format_settings(options.settings)])
 
 

@@ -289,7 +289,7 @@ def _read_rig_toml(table: ForeignTable, options: ImportOptions) -> str:
     profile, rig = options.profile, options.rig
     if rig is None and profile is None and _has_config_texts(table):
         return table.texts["rig_toml"]
-    option = "" if rig is None else "--rig"
+    option = "" if rig is None else "--table"
     if rig is None:
         rig = (
             "simulated" if profile is None else load_config(profile, Profile, "test profile")[0].rig

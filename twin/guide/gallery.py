@@ -3,7 +3,7 @@
 import re
 from textwrap import dedent
 
-import typer
+from typer.core import TyperGroup
 
 from twin.guide.loops import (
     LEVEL_G,
@@ -28,7 +28,7 @@ ACTIONS = {
 }
 
 
-def write_gallery(_: typer.Typer) -> str:
+def write_gallery(_: TyperGroup) -> str:
     """Return the page of all effects, built in and of plug-ins."""
     library = (*EFFECTS, *load_plugins())
     overview = format_table(

@@ -7,7 +7,7 @@ paper_features.json, because the search takes minutes.
 from collections.abc import Iterable
 from pathlib import Path
 
-import typer
+from typer.core import TyperGroup
 
 from twin.discovery.result import FeatureVerdict, Interval, label_feature, name_fit
 from twin.guide.reference import format_table
@@ -17,7 +17,7 @@ RESULT_FILE = Path(__file__).with_name("paper_features.json")
 MAX_FITS = 8  # of the ranking
 
 
-def write_paper_gap(_: typer.Typer) -> str:
+def write_paper_gap(_: TyperGroup) -> str:
     """Return the page: features as given, refitted and with the best effect, price, next run."""
     content = FeatureVerdict.model_validate_json(RESULT_FILE.read_text(encoding="utf-8"))
     best = content.best_fit or content.refitted

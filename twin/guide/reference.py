@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import typer
+from typer.core import TyperGroup
 
 from table_io.channels import CHANNELS
 from table_io.config.base import ConfigModel
@@ -45,7 +45,7 @@ def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     )
 
 
-def write_key_reference(_: typer.Typer) -> str:
+def write_key_reference(_: TyperGroup) -> str:
     """Return the page of all keys of all TOML files."""
     parts = [
         "# Configuration keys\n\nAll files are TOML. The ending of a key states its unit. An "
@@ -68,12 +68,13 @@ def _format_key(key: KeyDescription) -> tuple[str, ...]:
     return f"`{key.key}`", key.unit, default, key.allowed, key.meaning
 
 
-def write_command_reference(app: typer.Typer) -> str:
+def write_command_reference(program: TyperGroup) -> str:
     """Return the page of all commands with their arguments and options."""
-    program: Any = typer.main.get_command(app)
+    context = program.context_class(program)
     panels: dict[str, list[str]] = {}
-    for name, command in program.commands.items():
-        if not command.hidden:
+    for name in program.commands:
+        _, command, _ = program.resolve_command(context, [name])
+        if command is not None and not command.hidden:
             panel = str(getattr(command, "rich_help_panel", None) or "Others")
             panels.setdefault(panel, []).extend(_describe_command(f"shaketwin {name}", command))
     parts = [
@@ -110,7 +111,7 @@ def _describe_command(name: str, command: Any) -> Iterator[str]:
         )
 
 
-def write_channel_reference(_: typer.Typer) -> str:
+def write_channel_reference(_: TyperGroup) -> str:
     """Return the page of the canonical channels."""
     rows = (
         (f"`{channel.name}`", channel.unit, channel.positive, channel.meaning)
@@ -123,7 +124,7 @@ def write_channel_reference(_: typer.Typer) -> str:
     )
 
 
-def write_api_reference(_: typer.Typer) -> str:
+def write_api_reference(_: TyperGroup) -> str:
     """Return the page of the Python interface, from the docstrings of its source.
 
     It is parsed, not imported: the import would compile kernels.

@@ -1,11 +1,13 @@
 """`list`, `new`, `explain` and `schema`: names, templates, keys and schemas of the TOML files."""
 
+import enum
 import json
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import typer
 from pydantic.json_schema import models_json_schema
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -19,9 +21,38 @@ from table_io.config.plugins import list_entry_points
 from table_io.config.profile import Profile
 from table_io.config.rig import BACKEND_GROUP, RigConfig, load_backend
 from table_io.errors import InputError, suggest
-from twin.cli.reference_commands import FileKind, ListKind
 from twin.system.terminal import console, print_line, print_table
 
+
+class FileKind(enum.StrEnum):
+    """Kind of a TOML file."""
+
+    test = "test"
+    rig = "rig"
+    model = "model"
+    campaign = "campaign"
+    map = "map"
+    study = "study"
+    features = "features"
+
+
+class ListKind(enum.StrEnum):
+    """Kind of names to list."""
+
+    tests = "tests"
+    rigs = "rigs"
+    models = "models"
+    campaigns = "campaigns"
+    studies = "studies"
+    features = "features"
+    effects = "effects"
+    channels = "channels"
+
+
+KindArgument = Annotated[
+    FileKind,
+    typer.Argument(metavar="test|rig|model|campaign|map|study|features", help="Kind of file."),
+]
 TEMPLATES = {
     FileKind.rig: "rigs/simulated",
     FileKind.model: "models/snm",
@@ -33,8 +64,10 @@ EXAMPLE_KIND = 'kind = "stepped_sine"'  # of the excitation of a new test
 WRITTEN_BY_CAMPAIGNS = ("[set_up]", "[resume]")
 
 
-def print_names(kind: ListKind) -> None:
-    """Print a table of the names of a kind."""
+def print_names(
+    kind: Annotated[ListKind, typer.Argument(metavar="|".join(ListKind), help="What to list.")],
+) -> None:
+    """List the names that commands take: yours first, then the shipped ones."""
     header: tuple[str, ...]
     rows: Iterator[tuple[str, ...]]
     if kind is ListKind.effects:
@@ -74,8 +107,13 @@ def _describe_folder(path: Path) -> str:
     return "shipped" if path.is_relative_to(PROFILES_DIR) else str(path.parent)
 
 
-def explain_key(name: str) -> None:
-    """Print what a key means, in each file and table that has it; InputError if none has."""
+def explain_key(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="KEY", help="Key of a file, with or without its table."),
+    ],
+) -> None:
+    """Explain a key of a file: its meaning, unit, default and limits."""
     from twin.guide.reference import CONFIG_FILES  # it imports the kernels
 
     entries = {
@@ -110,8 +148,14 @@ def _explain(key: KeyDescription) -> Iterator[str]:
     yield "required" if key.is_required else f"default: {key.default or 'none'}"
 
 
-def write_template(kind: FileKind, path: Path) -> None:
-    """Write a commented file of a kind; InputError if the file exists."""
+def write_template(
+    kind: Annotated[
+        FileKind,
+        typer.Argument(metavar="test|rig|model|campaign|study|features", help="Kind of file."),
+    ],
+    path: Annotated[Path, typer.Argument(metavar="FILE", help="New .toml file.")],
+) -> None:
+    """Write a commented file to edit; `check` accepts a new test as it is."""
     if kind is FileKind.test:
         text = _format_test_template()
     elif kind in TEMPLATES:
@@ -174,8 +218,13 @@ def _format_table(table: TableDescription, values: Mapping[str, Any]) -> Iterato
             yield f"# {key.key} = {key.default or '...'}  # {comment}"
 
 
-def write_schema(kind: FileKind, path: Path | None) -> None:
-    """Print or write the JSON schema of a kind of file."""
+def write_schema(
+    kind: KindArgument,
+    path: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE", help="New file; default: print.")
+    ] = None,
+) -> None:
+    """Print the JSON schema of a kind of file, by which editors complete and check its keys."""
     text = json.dumps(build_file_schema(kind), indent=1)
     if path is None:
         print(text)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import typer
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
+from typer.core import TyperGroup
 
 from table_io.errors import InputError
 from twin.guide.gallery import write_gallery
@@ -40,7 +40,7 @@ class GuidePage:
 
     slug: str
     title: str
-    source: "Path | Callable[[typer.Typer], str]"
+    source: "Path | Callable[[TyperGroup], str]"
 
     @property
     def file_name(self) -> str:
@@ -50,10 +50,10 @@ class GuidePage:
     def markdown_path(self) -> Path:
         return self.source if isinstance(self.source, Path) else PAGES_DIR / f"{self.slug}.md"
 
-    def read(self, app: typer.Typer) -> str:
+    def read(self, program: TyperGroup) -> str:
         """Return the Markdown."""
         if not isinstance(self.source, Path):
-            return self.source(app)
+            return self.source(program)
         text = self.source.read_text(encoding="utf-8")
         return convert_notebook(text, self.source.name) if self.source.suffix == ".ipynb" else text
 
@@ -143,7 +143,7 @@ CHAPTERS = (
 )
 
 
-def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CHAPTERS) -> Path:
+def build_guide(folder: Path, program: TyperGroup, chapters: Sequence[Chapter] = CHAPTERS) -> Path:
     """Write all pages to `folder`, replacing an older guide; return the path of the first page.
 
     InputError if the folder holds anything else, or lists every link that leads nowhere.
@@ -151,7 +151,7 @@ def build_guide(folder: Path, app: typer.Typer, chapters: Sequence[Chapter] = CH
     pages = [page for chapter in chapters for page in chapter.pages]
     _prepare_folder(folder, folder / pages[0].file_name)
     links = _PageLinks(pages, folder)
-    rendered = {page: links.render(page, page.read(app)) for page in pages}
+    rendered = {page: links.render(page, page.read(program)) for page in pages}
     faults = links.find_broken(rendered)
     if faults:
         raise InputError("broken links", where="guide", faults=faults)

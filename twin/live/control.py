@@ -29,7 +29,7 @@ def find_run(link: BusLink, connect: str, rig: str) -> str:
             connect,
             f"no test is running there on rig {rig!r}",
             "start one with `shaketwin run`, or give the `name` in the rig file of the "
-            "running rig with --rig",
+            "running rig with --table",
         )
     return runs[0]
 

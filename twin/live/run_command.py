@@ -1,7 +1,7 @@
 """`run`: run a test on the table, in real time or at full speed."""
 
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from table_io.clock import RealClock, local_datetime
@@ -9,7 +9,6 @@ from table_io.config.base import parse_toml
 from table_io.config.calibration import find_overdue_calibrations
 from table_io.config.profile import Specimen
 from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
-from twin.cli.live_commands import start_page
 from twin.model.config import ModelConfig
 from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.security.credentials import Credentials, credentials_folder
@@ -35,16 +34,16 @@ def run_test(
     keys: Credentials | None = None,
     router: str = "",
     remote_twin: bool = False,
-    web: str | None = None,
+    start_page: Callable[[str], AbstractContextManager[None]] | None = None,
 ) -> int:
     """Run a test on the table, in real time or at full speed; return the exit code.
 
-    `web` is the address of its page, "" for the default and None for no page.
+    `start_page` serves the page of the tests of a rig while its context lasts.
     """
     with show_status("checking the test"):
         config = read_run_config(profile, table, model)
     if unpaced:
-        check_full_speed(config.rig, has_page=web is not None)
+        check_full_speed(config.rig, has_page=start_page is not None)
     else:
         check_endpoint(config.rig.name, listen, has_keys=keys is not None)
         check_realtime(config, profile)
@@ -64,7 +63,7 @@ def run_test(
         f"{config.expected_s:.0f} s on {config.rig.title} "
         f"-> {folder}"
     )
-    with nullcontext() if web is None else start_page(web, listen, keys, config.rig.name):
+    with nullcontext() if start_page is None else start_page(config.rig.name):
         with catch_interrupts() as poll_interrupt:
             if unpaced:
                 _run_unpaced(config, run_id, folder, poll_interrupt)

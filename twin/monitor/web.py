@@ -157,7 +157,7 @@ def announce_page(url: str) -> None:
 
 @contextmanager
 def start_page_process(
-    web_listen: str, listen: str, rig: str, credentials: Credentials | None
+    web_listen: str, listen: str, credentials: Credentials | None, rig: str
 ) -> Iterator[None]:
     """Run the page of a run in a process of its own and print its address; ends with the block.
 

@@ -16,7 +16,7 @@ from table_io.config.profile import load_profile
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.server import serve_machine_table
-from table_io.sim.machine.table import PlaybackPlan, TableService, find_simulator
+from table_io.sim.machine.table import PlaybackPlan, TableService, find_simulator, read_drive
 from twin.live.process_config import request_realtime
 
 TABLE_PRIORITY = 60  # above the rig: a real machine does not depend on its load
@@ -50,7 +50,7 @@ def serve_table(
 
     The specimen is that of `profile` if the machine's protocol does not transmit it.
     """
-    rig, _ = load_rig(find_config(rig_name, "rigs", option="--rig"))
+    rig, _ = load_rig(find_config(rig_name, "rigs", option="--table"))
     if not 1.0 <= time_scale <= MAX_TIME_SCALE:
         raise InputError(
             "out of range",
@@ -106,8 +106,6 @@ def _plan_playback(controller: ExternalController) -> PlaybackPlan | None:
         )
     if controller.play is None:
         return None
-    from twin.exchange.drive_file import read_drive
-
     return PlaybackPlan(*read_drive(controller.play), controller.ppm, controller.after_s)
 
 

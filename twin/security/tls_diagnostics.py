@@ -166,5 +166,5 @@ def diagnose_missing_role(
             ASK_FOR_KEYS,
         )
     return ConnectionProblem(
-        f"no rig called {rig!r} answers there", "give the name of the rig with --rig"
+        f"no rig called {rig!r} answers there", "give the name of the rig with --table"
     )

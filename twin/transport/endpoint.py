@@ -77,7 +77,7 @@ def check_endpoint(rig: str, endpoint: str, has_keys: bool) -> None:
             key="rig",
             value=rig,
             allowed="letters, digits and _ . -",
-            remedy="change `name` in the rig file, or --rig",
+            remedy="change `name` in the rig file, or --table",
         )
     if endpoint.startswith(LOCAL_SOCKET_PREFIX) and not has_keys:
         return

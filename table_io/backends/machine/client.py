@@ -60,7 +60,7 @@ def _connect(rig: RigConfig, machine: MachineConfig) -> socket.socket:
         raise InputError(
             f"no table answers there ({error.strerror or error})",
             where=endpoint.text,
-            remedy=f"start it first, in another terminal: shaketwin table --rig {rig.name}",
+            remedy=f"start it first, in another terminal: shaketwin table --table {rig.name}",
         ) from None
 
 
@@ -103,7 +103,7 @@ class MachineBackend:
                 raise InputError(
                     "the program that listens there does not answer as a simulated table",
                     where=self._machine.endpoint,
-                    remedy=f"end it, then start: shaketwin table --rig {self._rig.name}",
+                    remedy=f"end it, then start: shaketwin table --table {self._rig.name}",
                 ) from None
             if answer.kind is MessageKind.GRANTED:
                 return

@@ -143,7 +143,7 @@ def connect_server(rig: RigConfig, endpoint: str) -> Any:
     except grpc.FutureTimeoutError:
         channel.close()
         hint = (
-            f", in another terminal: shaketwin table --rig {rig.name}" if rig.is_simulated else ""
+            f", in another terminal: shaketwin table --table {rig.name}" if rig.is_simulated else ""
         )
         raise InputError(
             f"no NI gRPC Device Server answers at {endpoint}", remedy=f"start it there{hint}"

@@ -71,7 +71,9 @@ def check_reachable(rig: RigConfig) -> None:
         socket.create_connection(wiring.address, CONNECT_TIMEOUT_S).close()
     except (OSError, UnicodeError) as error:
         reason = getattr(error, "strerror", None) or error
-        hint = f"for a simulated one: shaketwin table --rig {rig.name}" if rig.is_simulated else ""
+        hint = (
+            f"for a simulated one: shaketwin table --table {rig.name}" if rig.is_simulated else ""
+        )
         raise InputError(
             f"no openDAQ device answers there ({reason})",
             where=wiring.device,

@@ -139,7 +139,7 @@ def query_target(
     raise InputError(
         f"no UDP target answers at {wiring.target}",
         remedy="start it, and check that it uses the address and port of the rig file (for the "
-        "simulated target: shaketwin table --rig udp_simulated)",
+        "simulated target: shaketwin table --table udp_simulated)",
     )
 
 

@@ -97,5 +97,5 @@ def test_run_without_device_is_refused(tmp_path: Path) -> None:
         ran = shaketwin("run", "short.toml", *FOLLOWED, "--out", "run", folder=tmp_path)
     assert ran.returncode == 2
     assert "no openDAQ device answers" in ran.stderr
-    assert "shaketwin table --rig follow_simulated" in ran.stderr
+    assert "shaketwin table --table follow_simulated" in ran.stderr
     assert not (tmp_path / "run").exists()

@@ -121,7 +121,7 @@ def test_silent_device_is_named(bench: Bench) -> None:
     away = get_wiring(bench.rig).model_copy(update={"device": "daq.nd://127.0.0.1:7499"})
     with pytest.raises(InputError, match="7499") as error:
         check_reachable(bench.rig.model_copy(update={"opendaq": away}))
-    assert "shaketwin table --rig" in error.value.remedy
+    assert "shaketwin table --table" in error.value.remedy
     check_reachable(bench.rig)
 
 

@@ -41,7 +41,7 @@ def controller(where: str, clock: Clock | None = None) -> MachineBackend:
     return MachineBackend(at(where), SPECIMEN, RATE_HZ, clock or RealClock())
 
 
-START = "shaketwin table --rig machine"
+START = "shaketwin table --table machine"
 
 
 @dataclass

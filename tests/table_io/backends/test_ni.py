@@ -338,7 +338,7 @@ def test_absent_server_is_refused_with_a_remedy() -> None:
     rig = parse_toml(CARD.replace("127.0.0.1:7470", "127.0.0.1:9"), RigConfig, "card")
     with pytest.raises(InputError) as error:
         check_reachable(rig)
-    assert "shaketwin table --rig ni_simulated" in error.value.remedy
+    assert "shaketwin table --table ni_simulated" in error.value.remedy
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
     with pytest.raises(InputError) as error:
         check_reachable(local)

@@ -106,7 +106,7 @@ def test_absent_target_is_refused_with_a_remedy() -> None:
     rig = rig_at(("127.0.0.1", free_port()))
     with pytest.raises(InputError, match=r"127\.0\.0\.1") as error:
         UdpBackend(rig, SPECIMEN, RATE_HZ, CLOCK).open()
-    assert "shaketwin table --rig udp_simulated" in error.value.remedy
+    assert "shaketwin table --table udp_simulated" in error.value.remedy
 
 
 def test_check_reachable_of_a_target_claims_nothing(target: Served) -> None:

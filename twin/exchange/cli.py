@@ -1,61 +1,36 @@
-"""Commands for files: verify, import, export; each imports its implementation when called."""
+"""Commands `drive`, `import` and `export`: files of other programs."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from twin.cli.run_path import LOG_HELP, parse_run_path
-
-FILES_PANEL = "Recording files"
-files_app = typer.Typer()
-
-
-def require_view_extra(wanted: bool) -> bool:
-    """Return the value of an option that needs Rerun; InputError if that is not installed."""
-    if wanted:
-        from twin.viewer.address import require_rerun
-
-        require_rerun("a Rerun view")
-    return wanted
+from twin.options import (
+    LogArgument,
+    ProfileArgument,
+    StepsOption,
+    TableOption,
+    require_view_extra,
+)
 
 
-StepsOption = Annotated[
-    str | None,
-    typer.Option(
-        "--steps",
-        metavar="FIRST:LAST",
-        help="Step indices FIRST:LAST, from 0, both included; or one index.",
-    ),
-]
-
-
-@files_app.command("verify", rich_help_panel=FILES_PANEL)
-def verify_command(
-    log: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG...",
-            parser=parse_run_path,
-            help="A log, the folder of a run, the parts of one log, or `last`.",
+def drive_command(
+    profile: ProfileArgument,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="FILE", help="New file.")],
+    table: TableOption = None,
+    format: Annotated[
+        str,
+        typer.Option(
+            "--format", help="csv, txt, rpc, uff, mat or wav; default: the ending of FILE."
         ),
-    ],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    repair: Annotated[
-        Path | None,
-        typer.Option("--repair", metavar="NEW", help="Write the recoverable data to this new log."),
-    ] = None,
+    ] = "",
 ) -> None:
-    """Verify that a recording is complete and can be replayed; list what is missing.
+    """Export the planned drive for an external controller, which `run --table` then follows."""
+    from twin.exchange.command import run_drive
 
-    Exit code 0: whole; 4: it has gaps, or the file is damaged or was altered; 2: no log.
-    """
-    from twin.replay.verify import verify_logs as command
-
-    raise typer.Exit(command(log, json, repair))
+    run_drive(profile, out, table, format)
 
 
-@files_app.command("import", rich_help_panel=FILES_PANEL)
 def import_command(
     files: Annotated[
         list[Path],
@@ -73,8 +48,8 @@ def import_command(
     profile: Annotated[
         Path | None, typer.Option("--profile", help="Test profile with specimen, gaps and sweep.")
     ] = None,
-    rig: Annotated[
-        str | None, typer.Option("--rig", help="Rig file or name, instead of the profile's.")
+    table: Annotated[
+        str | None, typer.Option("--table", help="Rig file or name, instead of the profile's.")
     ] = None,
     columns: Annotated[
         Path | None,
@@ -125,7 +100,6 @@ def import_command(
     ] = False,
 ) -> None:
     """Import tables of samples as logs; without -o, propose which column is which channel."""
-    from table_io.config.folders import resolve_config
     from twin.exchange.command import list_contents, parse_band, run_import
     from twin.exchange.import_table import ImportOptions
 
@@ -134,8 +108,8 @@ def import_command(
         "rest": rest, "integrate_hz": parse_band(integrate),
     }  # fmt: skip
     options = ImportOptions(
-        profile=None if profile is None else resolve_config(profile, "tests"),
-        rig=rig,
+        profile=profile,
+        rig=table,
         columns=columns,
         accept=accept,
         settings={key: value for key, value in stated.items() if value is not None},
@@ -146,9 +120,8 @@ def import_command(
     raise typer.Exit(run_import(files, out, save_map, options))
 
 
-@files_app.command("export", rich_help_panel=FILES_PANEL)
 def export_command(
-    log: Annotated[Path, typer.Argument(metavar="LOG", parser=parse_run_path, help=LOG_HELP)],
+    log: LogArgument,
     csv: Annotated[bool, typer.Option("--csv", help="CSV text without loss of precision.")] = False,
     parquet: Annotated[
         bool, typer.Option("--parquet", help="Parquet with units and profile.")
@@ -176,13 +149,7 @@ def export_command(
 ) -> None:
     """Export measurement and twin of a log for other tools, in several formats at once."""
     from twin.exchange.command import run_export
-    from twin.exchange.export import ExportOptions
 
     requested = {"csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd}
     formats = [kind for kind, wanted in requested.items() if wanted]
-    step_span = None
-    if steps is not None:
-        from twin.recording.tabular import parse_step_range
-
-        step_span = parse_step_range(steps)
-    run_export(ExportOptions(log, tuple(formats), out, tuple(channel or ()), step_span))
+    run_export(log, formats, out, channel or [], steps)

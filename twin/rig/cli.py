@@ -1,17 +1,60 @@
-"""Commands for the hardware; each imports its implementation when called."""
+"""Commands `table`, `check`, `calibrate` and `devices`: the machine and its sensors."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from twin.cli.examples import complete_names, describe_names
-
-PLAN_PANEL = "Before a test"
-hardware_app = typer.Typer()
+from table_io.errors import InputError
+from twin.options import JsonOption, complete_names, describe_names
 
 
-@hardware_app.command("check", rich_help_panel=PLAN_PANEL)
+def table_command(
+    table: Annotated[str, typer.Option("--table", help="Rig file or name.")] = "machine",
+    listen: Annotated[
+        str | None,
+        typer.Option(
+            "--listen", help="tcp/127.0.0.1:PORT or unix/PATH, instead of the rig file's."
+        ),
+    ] = None,
+    log: Annotated[
+        Path | None, typer.Option("--log", help="New file for the flight recorder: every sample.")
+    ] = None,
+    time_scale: Annotated[
+        float, typer.Option("--time-scale", help="Speed relative to real time, for tests.")
+    ] = 1.0,
+    profile: Annotated[
+        str,
+        typer.Option("--profile", help="Test profile whose specimen is on the table."),
+    ] = "quickstart",
+    play: Annotated[
+        Path | None,
+        typer.Option(
+            "--play",
+            metavar="FILE",
+            help="Drive file that the simulated external controller plays.",
+        ),
+    ] = None,
+    ppm: Annotated[
+        float, typer.Option("--ppm", help="Clock error of that controller in parts per million.")
+    ] = 0.0,
+    after: Annotated[
+        float,
+        typer.Option(
+            "--after",
+            metavar="S",
+            help="Delay in s between the start of acquisition and its drive.",
+        ),
+    ] = 5.0,
+) -> None:
+    """Start the simulated table as a separate machine, for `run PROFILE --table machine`."""
+    from twin.rig.table import ExternalController, serve_table
+
+    controller = ExternalController(play, ppm, after)
+    serve_table(table, listen, log, time_scale, sys.stdout, profile, controller)
+
+
 def check_command(
     profile: Annotated[
         Path | None,
@@ -41,16 +84,14 @@ def check_command(
     table and the mass; the table is not driven.
     """
     if profile is not None and not (unattended or json):
-        from twin.rig.check import check_profile as preflight
+        from twin.rig.check import check_profile
 
-        preflight(profile, table, out)
+        check_profile(profile, table, out)
     elif profile is None and table is not None and out is None:
-        from twin.rig.check_table import check_wiring
+        from twin.rig.wiring_table import check_wiring
 
         raise typer.Exit(check_wiring(table, unattended, json))
     else:
-        from table_io.errors import InputError
-
         raise InputError(
             "these arguments do not go together",
             where="check",
@@ -59,7 +100,6 @@ def check_command(
         )
 
 
-@hardware_app.command("calibrate", rich_help_panel=PLAN_PANEL)
 def calibrate_command(
     channel: Annotated[str, typer.Argument(metavar="CHANNEL", help="Channel of the sensor.")],
     table: Annotated[str, typer.Option("--table", help="Rig file or name.")],
@@ -93,24 +133,22 @@ def calibrate_command(
 
     Leaves a dated record, which goes into every recording from then on; the rig file is not edited.
     """
-    from twin.rig.calibrate import CalibrationRequest
-    from twin.rig.calibrate import calibrate_sensor as command
+    from twin.rig.calibrate import CalibrationRequest, calibrate_sensor
 
     request = CalibrationRequest(
         channel, table, points, shunt, tolerance, applied_sd, unattended, out
     )
-    raise typer.Exit(command(request))
+    raise typer.Exit(calibrate_sensor(request))
 
 
-@hardware_app.command("devices", rich_help_panel=PLAN_PANEL)
 def devices_command(
     ni: Annotated[
         str | None,
         typer.Option("--ni", metavar="HOST:PORT", help="Also query this NI gRPC device server."),
     ] = None,
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    json: JsonOption = False,
 ) -> None:
     """List rig files, NI and openDAQ devices that respond, with their channels."""
-    from twin.rig.devices import print_devices as command
+    from twin.rig.devices import print_devices
 
-    command(ni, json)
+    print_devices(ni, json)

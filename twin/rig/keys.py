@@ -11,6 +11,7 @@ Folders have mode 0700 and files 0600. Only `renew` replaces keys, and a name is
 another person: its old certificate would become valid again.
 """
 
+import enum
 import json
 import os
 import re
@@ -22,7 +23,9 @@ from datetime import UTC, datetime, timedelta
 from ipaddress import ip_address
 from itertools import count
 from pathlib import Path
+from typing import Annotated
 
+import typer
 from rich.table import Table
 
 from table_io.clock import local_datetime
@@ -73,12 +76,37 @@ ACCESS_TEXT = f"""\
 [people]
 """
 
+keys_app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    help="Manage credentials and roles for access over a network (twin/security/KEYS.md).",
+)
 
-def create_keys(folder: Path, hosts: Sequence[str]) -> None:
-    """Create an authority and the rig's keys in a new folder; InputError if it has content.
+FolderArgument = Annotated[
+    Path, typer.Argument(metavar="FOLDER", help="The laboratory's credentials folder.")
+]
+NameArgument = Annotated[str, typer.Argument(metavar="NAME", help="Name of a user: a-z 0-9 _ -.")]
 
-    The rig's certificate is valid for this computer's names and `hosts`.
-    """
+
+class Role(enum.StrEnum):
+    """Role of a user at the rig."""
+
+    observe = "observe"
+    record = "record"
+    twin = "twin"
+    command = "command"
+    router = "router"
+
+
+@keys_app.command("new")
+def create_keys(
+    folder: FolderArgument,
+    hosts: Annotated[
+        list[str] | None,
+        typer.Option("--host", help="Name or address of the rig's machine; repeatable."),
+    ] = None,
+) -> None:
+    """Create an authority, the rig's credentials and an empty list of users."""
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise InputError(
             "exists and has content; keys are never overwritten",
@@ -89,7 +117,7 @@ def create_keys(folder: Path, hosts: Sequence[str]) -> None:
     names = [
         *LOCAL_HOSTS,
         *(hostname for hostname in hostnames if _is_host(hostname)),
-        *map(_validate_host, hosts),
+        *map(_validate_host, hosts or ()),
     ]
     names = list(dict.fromkeys(name.lower() for name in names))
     issued_at = local_datetime()
@@ -102,6 +130,19 @@ def create_keys(folder: Path, hosts: Sequence[str]) -> None:
     print_line(f"{folder}: an authority, and the rig's keys as {', '.join(names)}")
     print_line(f"next: shaketwin keys add {folder} NAME --role {'|'.join(ROLES)}")
     print_line(f"then: shaketwin run PROFILE --listen tls/HOST:7447 --keys {folder}")
+
+
+@keys_app.command("add")
+def add_command(
+    folder: FolderArgument,
+    name: NameArgument,
+    role: Annotated[Role, typer.Option("--role", help="Role of the user.")],
+    host: Annotated[
+        list[str] | None, typer.Option("--host", help="Name or address of a router.")
+    ] = None,
+) -> None:
+    """Create credentials for a user in FOLDER/people/NAME and add the user to access.toml."""
+    add_person(folder, name, role.value, host or [])
 
 
 def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None:
@@ -135,12 +176,16 @@ def add_person(folder: Path, name: str, role: str, hosts: Sequence[str]) -> None
     )
 
 
-def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
-    """Replace the keys of a person or, without a name, of the rig.
-
-    Without `hosts` the new certificate is valid for those of the old one.
-    """
-    hosts = [_validate_host(host) for host in hosts]
+@keys_app.command("renew")
+def renew_keys(
+    folder: FolderArgument,
+    name: Annotated[
+        str | None, typer.Argument(metavar="[NAME]", help="User; default: the rig.")
+    ] = None,
+    hosts: Annotated[list[str] | None, typer.Option("--host", help="Replace its hosts.")] = None,
+) -> None:
+    """Renew credentials before they expire; the old ones are kept."""
+    hosts = [_validate_host(host) for host in hosts or ()]
     if name is None:
         old_hosts = certificate_hosts(_read(folder / CERTIFICATE_FILE))
         rig = _issue(folder, RIG_NAME, list(dict.fromkeys([*LOCAL_HOSTS, *(hosts or old_hosts)])))
@@ -166,11 +211,18 @@ def renew_keys(folder: Path, name: str | None, hosts: Sequence[str]) -> None:
     )
 
 
-def issue_code(folder: Path, name: str, page: str) -> None:
-    """Issue an access code to the web page to a person on the access list; print it once.
-
-    It replaces an earlier code of the person. With the address of the `page` a QR code logs in.
-    """
+@keys_app.command("code")
+def issue_code(
+    folder: FolderArgument,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="User on the access list.")],
+    page: Annotated[
+        str,
+        typer.Option(
+            "--page", metavar="URL", help="Address of the page: prints a QR code that logs in."
+        ),
+    ] = "",
+) -> None:
+    """Issue a code with which a user logs in to the web page; it replaces an earlier one."""
     if name not in read_people(folder):
         raise _unknown_name_error(folder, name, read_people(folder))
     if page and not re.fullmatch(r"https://[^/#?\s]+/?", page):
@@ -194,8 +246,9 @@ def issue_code(folder: Path, name: str, page: str) -> None:
         print_qr_code(url)
 
 
-def remove_person(folder: Path, name: str) -> None:
-    """Revoke a person's role; the gateway rejects the certificate from its next start on."""
+@keys_app.command("remove")
+def remove_person(folder: FolderArgument, name: NameArgument) -> None:
+    """Revoke a user's role: the certificate is refused from then on."""
     people = read_people(folder)
     if name not in people:
         raise _unknown_name_error(folder, name, people)
@@ -209,8 +262,9 @@ def remove_person(folder: Path, name: str) -> None:
     )
 
 
-def list_keys(folder: Path) -> None:
-    """Print role and expiry of every name, of the rig and of the authority."""
+@keys_app.command("list")
+def list_keys(folder: FolderArgument) -> None:
+    """List users, roles and the expiry of their certificates."""
     people = read_people(folder)
     table = Table(box=None, padding=(0, 2, 0, 0))
     for title in ("name", "role", "valid until", ""):
@@ -350,11 +404,17 @@ def _validate_host(host: str) -> str:
     return host
 
 
-def print_router_settings(folder: Path, name: str, listen: str, rig: str) -> None:
-    """Print the settings for a zenohd started in the router's folder, FOLDER/people/NAME.
-
-    They contain the current access list: print them again when it changes.
-    """
+@keys_app.command("router")
+def print_router_settings(
+    folder: FolderArgument,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="User with the role router.")],
+    listen: Annotated[
+        str, typer.Option("--listen", help="Endpoint at which the router listens.")
+    ] = "tls/0.0.0.0:7447",
+    rig: Annotated[str, typer.Option("--table", help="Name of the rig.")] = "simulated",
+) -> None:
+    """Print the configuration of a zenoh router (zenohd) with the same access control."""
+    # For a zenohd started in FOLDER/people/NAME; the access list in it is the current one.
     people = read_people(folder)
     if people.get(name) != ROUTER_ROLE:
         routers = [router for router, role in people.items() if role == ROUTER_ROLE]

@@ -1,26 +1,14 @@
-"""Commands `discover`, `identify` and `table-twin`; they import slow modules only when run."""
+"""Commands `discover` and `identify`."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from twin.cli.run_path import MEASURED_LOG_HELP, parse_measured_path
-
-LEARN_PANEL = "Identification from recordings"
-LogPaths = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="LOG...", parser=parse_measured_path, help=f"{MEASURED_LOG_HELP} Repeatable."
-    ),
-]
+from twin.options import MEASURED_LOG_HELP, MeasuredLogArguments, parse_measured_path
 
 
-identification_app = typer.Typer()
-
-
-@identification_app.command("discover", rich_help_panel=LEARN_PANEL)
-def discover_missing_effect(
+def discover_command(
     logs: Annotated[
         list[Path] | None,
         typer.Argument(
@@ -60,9 +48,9 @@ def discover_missing_effect(
         bool,
         typer.Option("--run", help="Play that test and judge again, until it is decided."),
     ] = False,
-    rig: Annotated[
+    table: Annotated[
         str,
-        typer.Option("--rig", help="Rig of these tests; omitted: that of the last recording."),
+        typer.Option("--table", help="Rig of these tests; omitted: that of the last recording."),
     ] = "",
     budget_min: Annotated[
         float, typer.Option("--budget-min", help="Rig time of these tests in minutes.")
@@ -84,16 +72,15 @@ def discover_missing_effect(
         raise typer.BadParameter("give one LOG or more, or --features FILE", param_hint="LOG...")
     from twin.discovery.command import parse_options, run_decision, run_discovery
 
-    options = parse_options(decide, run, rig, budget_min, yes, speed)
+    options = parse_options(decide, run, table, budget_min, yes, speed)
     if run and options is not None:
         raise typer.Exit(run_decision(logs, model, out, without or [], held_out or [], options))
     _, code = run_discovery(logs, model, out, without or [], held_out or [], options)
     raise typer.Exit(code)
 
 
-@identification_app.command("identify", rich_help_panel=LEARN_PANEL)
-def identify_from_logs(
-    logs: LogPaths,
+def identify_command(
+    logs: MeasuredLogArguments,
     model: Annotated[
         str, typer.Option("--model", help="Start from this model: a name or a .toml file.")
     ] = "snm",
@@ -106,22 +93,3 @@ def identify_from_logs(
     from twin.discovery.command import run_identification
 
     raise typer.Exit(run_identification(logs, model, out))
-
-
-@identification_app.command("table-twin", rich_help_panel=LEARN_PANEL)
-def identify_table_from_log(
-    logs: LogPaths,
-    out: Annotated[
-        Path, typer.Option("--out", metavar="FILE", help="New .toml file for the table's twin.")
-    ] = Path("table.toml"),
-    with_effects: Annotated[
-        bool,
-        typer.Option(
-            "--effects/--no-effects", help="Name the effects that the table's twin lacks."
-        ),
-    ] = True,
-) -> None:
-    """Identify the table itself from a rehearsal: oil, valve, friction, loop, frame, effects."""
-    from twin.earthquakes.command import identify_table_command as command
-
-    raise typer.Exit(command(logs, out, with_effects))

@@ -1,0 +1,73 @@
+"""Commands `table-drive` and `table-twin`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.options import (
+    MeasuredLogArguments,
+    OutOption,
+    ProfileArgument,
+    Speed,
+    TableOption,
+    parse_run_path,
+)
+
+
+def table_drive_command(
+    profile: ProfileArgument,
+    twin: Annotated[
+        Path, typer.Option("--table-twin", metavar="FILE", help="File of `shaketwin table-twin`.")
+    ],
+    band_hz: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--band",
+            metavar="LOW HIGH",
+            help="Frequencies to be right, in Hz; omitted: tracking.band_hz of the profile.",
+        ),
+    ] = None,
+    out: OutOption = None,
+    table: TableOption = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(
+            "--after",
+            metavar="LOG",
+            parser=parse_run_path,
+            help="Correct the drive of this run by what its table lacked.",
+        ),
+    ] = None,
+    iterate: Annotated[
+        int | None,
+        typer.Option("--iterate", min=0, max=20, help="Run it, and so often a corrected drive."),
+    ] = None,
+    speed: Annotated[
+        Speed, typer.Option("--speed", help="Of the runs: in real time, or as fast as possible.")
+    ] = Speed.realtime,
+) -> None:
+    """Compute the command by which the table follows a record, on the table's twin."""
+    from twin.earthquakes.command import compute_drive_command
+    from twin.earthquakes.task import TableDriveOptions
+
+    options = TableDriveOptions(profile, twin, band_hz, table, after)
+    raise typer.Exit(compute_drive_command(options, out, iterate, speed is Speed.max))
+
+
+def table_twin_command(
+    logs: MeasuredLogArguments,
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="New .toml file for the table's twin.")
+    ] = Path("table.toml"),
+    with_effects: Annotated[
+        bool,
+        typer.Option(
+            "--effects/--no-effects", help="Name the effects that the table's twin lacks."
+        ),
+    ] = True,
+) -> None:
+    """Identify the table itself from a rehearsal: oil, valve, friction, loop, frame, effects."""
+    from twin.earthquakes.command import identify_table_command
+
+    raise typer.Exit(identify_table_command(logs, out, with_effects))

@@ -1,0 +1,1 @@
+"""What recordings hold, of a run or of a folder of any kind: curves, report, index, comparison."""
