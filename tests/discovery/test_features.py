@@ -15,7 +15,6 @@ from twin.discovery.features.config import Feature, FeatureSet
 from twin.discovery.features.continued_curve import (
     compute_curve,
     find_permanent_gap_mm,
-    set_total_gap,
     sweep_curve,
 )
 from twin.discovery.features.curve import find_folds_along
@@ -32,6 +31,7 @@ from twin.discovery.features.search import (
 )
 from twin.discovery.features.task import judge_discovery
 from twin.discovery.parameters import ParameterSet
+from twin.dynamics.period_map import set_total_gap
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.model.parameters import Parameters
@@ -88,7 +88,7 @@ def test_a_fault_in_a_file_names_its_key(old: str, new: str, key: str) -> None:
 def test_the_base_has_the_curves_of_its_closed_form() -> None:
     """Numbers of the exact solver that are stated for the paper's model."""
     free = compute_curve(set_total_gap(SNM, math.inf), PAPER.test)
-    g4 = compute_curve(set_total_gap(SNM, 4.0), PAPER.test)
+    g4 = compute_curve(set_total_gap(SNM, 0.004), PAPER.test)
     assert free is not None
     assert g4 is not None
     assert free.find_peak() == (pytest.approx(1.2678, abs=2e-3), pytest.approx(0.030537, rel=1e-3))
@@ -110,7 +110,7 @@ def test_the_base_has_the_curves_of_its_closed_form() -> None:
     ],
 )
 def test_describing_functions_agree_with_continuation(model: Model, gap_mm: float) -> None:
-    model = set_total_gap(model, gap_mm)
+    model = set_total_gap(model, gap_mm / 1e3)
     near = approximate_curve(model, PAPER.test.acceleration_m_s2)
     exact = compute_curve(model, PAPER.test)
     assert near is not None
@@ -121,7 +121,7 @@ def test_describing_functions_agree_with_continuation(model: Model, gap_mm: floa
 
 
 def test_a_sweep_finds_the_folds_to_within_its_steps() -> None:
-    model = set_total_gap(SNM, 4.0)
+    model = set_total_gap(SNM, 0.004)
     swept, followed = sweep_curve(model, PAPER.test), compute_curve(model, PAPER.test)
     assert swept is not None
     assert followed is not None

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from twin.discovery.features.curve import MIN_EXCESS_M, ResponseCurve, join_dire
 from twin.dynamics.continuation import continue_branch
 from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.orbits import Orbit, settle_to_orbit
-from twin.dynamics.period_map import FREQUENCY
+from twin.dynamics.period_map import FREQUENCY, set_total_gap
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 
@@ -29,12 +28,6 @@ GAP_ROUNDS = 2  # of the search for permanent contact; a linear bumper needs one
 MAX_DEEPENINGS = 3  # doublings of the precompression from which that search starts
 
 CurveMaker = Callable[[Model], "ResponseCurve | None"]
-
-
-def set_total_gap(model: Model, gap_mm: float) -> Model:
-    """Return the model at a total gap, half of it on each side."""
-    base = replace(model.base, gap_r=gap_mm / 2e3, gap_l=gap_mm / 2e3)
-    return Model(base, model.effects)
 
 
 def find_curve_limits(model: Model, test: FeatureTest) -> tuple[float, float]:
@@ -132,7 +125,7 @@ def find_permanent_gap_mm(model: Model, gap_mm: float, make_curve: CurveMaker) -
     """
     excess_m = math.nan
     for _ in range(MAX_DEEPENINGS + 1):
-        curve = make_curve(set_total_gap(model, gap_mm))
+        curve = make_curve(set_total_gap(model, gap_mm / 1e3))
         excess_m = math.nan if curve is None else curve.largest_excess_m
         if excess_m < 0:
             break
@@ -141,6 +134,6 @@ def find_permanent_gap_mm(model: Model, gap_mm: float, make_curve: CurveMaker) -
         if not excess_m < 0:
             return math.nan
         gap_mm -= 2e3 * 0.9 * excess_m  # stays in permanent contact
-        curve = make_curve(set_total_gap(model, gap_mm))
+        curve = make_curve(set_total_gap(model, gap_mm / 1e3))
         excess_m = math.nan if curve is None else curve.largest_excess_m
     return gap_mm - 2e3 * excess_m

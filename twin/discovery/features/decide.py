@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from twin.discovery.features.config import FeatureSet, FeatureTest
-from twin.discovery.features.continued_curve import compute_curve, set_total_gap
+from twin.discovery.features.continued_curve import compute_curve
 from twin.discovery.features.curve import ResponseCurve
 from twin.discovery.features.describing_function import approximate_curve
 from twin.discovery.features.prediction import format_hysteresis
+from twin.dynamics.period_map import set_total_gap
 from twin.model.model import Model
 
 LEVEL_FACTORS = (0.5, 1.0, 2.0)  # of the level of the features
@@ -75,7 +76,7 @@ def _compare_settings(
     for gap_mm, factor in settings:
         level_g = factor * features.test.acceleration_g
         own = features.test.model_copy(update={"acceleration_g": level_g})
-        curves = [make_curve(set_total_gap(model, gap_mm), own) for model in (first, second)]
+        curves = [make_curve(set_total_gap(model, gap_mm / 1e3), own) for model in (first, second)]
         if curves[0] is None or curves[1] is None:
             continue
         test = _compare_curves(features, curves[0], curves[1], gap_mm, factor)

@@ -22,7 +22,7 @@ from scipy.optimize import least_squares
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
 from twin.discovery.features.config import FeatureSet
-from twin.discovery.features.continued_curve import compute_curve, set_total_gap
+from twin.discovery.features.continued_curve import compute_curve
 from twin.discovery.features.curve import ResponseCurve
 from twin.discovery.features.prediction import (
     Measurement,
@@ -42,6 +42,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     list_effect_parameters,
 )
+from twin.dynamics.period_map import set_total_gap
 from twin.laws.library import find_effect
 from twin.model.model import Model
 
@@ -77,7 +78,7 @@ class FeatureProblem:
         curves = [
             curve
             for gap in features.gaps_mm
-            if (curve := compute_curve(set_total_gap(model, gap), features.test)) is not None
+            if (curve := compute_curve(set_total_gap(model, gap / 1e3), features.test)) is not None
         ]
         peaks = [peak for curve in curves if math.isfinite((peak := curve.find_peak())[0])]
         if not peaks:

@@ -12,10 +12,10 @@ from twin.discovery.features.config import KIND_KEYS, Feature, FeatureSet
 from twin.discovery.features.continued_curve import (
     compute_curve,
     find_permanent_gap_mm,
-    set_total_gap,
 )
 from twin.discovery.features.curve import ResponseCurve
 from twin.discovery.features.describing_function import approximate_curve
+from twin.dynamics.period_map import set_total_gap
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 
@@ -58,7 +58,7 @@ def measure_model(
     features: FeatureSet, model: Model, make_curve: Callable[[Model], ResponseCurve | None]
 ) -> Measurement:
     """Return the quantities of every feature but impacts of a model, with the given curves."""
-    curves = {gap: make_curve(set_total_gap(model, gap)) for gap in features.gaps_mm}
+    curves = {gap: make_curve(set_total_gap(model, gap / 1e3)) for gap in features.gaps_mm}
     quantities: list[Quantities] = []
     methods: list[str] = []
     for feature in features.features:
@@ -108,7 +108,7 @@ def measure_impact_share(features: FeatureSet, feature: Feature, model: Model) -
     assert feature.gap_mm is not None
     try:
         sweep = simulate_sweep(
-            set_total_gap(model, feature.gap_mm),
+            set_total_gap(model, feature.gap_mm / 1e3),
             [feature.at_hz],
             features.test.acceleration_m_s2,
             TRANSIENT_CYCLES + COUNTED_CYCLES,
