@@ -392,7 +392,7 @@ def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path
 def test_a_scheduler_that_does_not_answer_leaves_no_folder(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("twin.system.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("twin.system.process_pool.CONNECT_TIMEOUT_S", 0.5)
     with raises_input_error(key="--scheduler"):
         command.run_study(
             whole_study / "study.toml", tmp_path / "out", None, "tcp://127.0.0.1:9", False, False

@@ -163,12 +163,12 @@ def test_a_scheduler_that_does_not_answer_is_refused(unused_port: int) -> None:
 
 @pytest.fixture
 def unused_port(monkeypatch: pytest.MonkeyPatch) -> int:
-    monkeypatch.setattr("twin.system.dask_cluster.CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("twin.system.process_pool.CONNECT_TIMEOUT_S", 0.5)
     return 9
 
 
 def test_a_cluster_whose_workers_all_die_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("twin.system.dask_cluster.MAX_IDLE_S", 2.0)
+    monkeypatch.setattr("twin.system.process_pool.MAX_IDLE_S", 2.0)
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
@@ -197,7 +197,7 @@ def test_a_worker_of_another_version_is_refused(
     scheduler: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     versions = read_installed_versions() | {"numpy": "0.1"}
-    monkeypatch.setattr("twin.system.dask_cluster.read_installed_versions", lambda: versions)
+    monkeypatch.setattr("twin.system.process_pool.read_installed_versions", lambda: versions)
     with raises_input_error(problem="numpy 0.1", key="--scheduler"):
         list(run_tasks(task_functions.square, [1], Workers(0, scheduler)))
 

@@ -5,7 +5,7 @@ Other packages add outcomes through entry points of the group `shaketwin.outcome
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeVar
@@ -14,8 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D
-from table_io.config.plugins import list_entry_points, load_entry_point, make_plugin_error
-from table_io.errors import InputError, suggest
+from table_io.errors import InputError
 from table_io.records import Step
 from twin.compare.curves import FloatND, Hysteresis, PrcJump, Solutions, detect_all_hysteresis
 from twin.dynamics.continuation import Branch
@@ -205,28 +204,3 @@ class Outcome:
     settings: Mapping[str, str] = field(default_factory=dict)
     required: tuple[str, ...] = ()
     test: str = ""
-
-
-def find_outcome(name: str) -> Outcome:
-    """Return an outcome, built-in before plug-in; InputError names the nearest."""
-    from twin.studies.maps.branch_outcomes import BRANCH_OUTCOMES
-    from twin.studies.maps.sweep_outcomes import SWEEP_OUTCOMES
-
-    known: Iterable[Outcome] = (*SWEEP_OUTCOMES, *BRANCH_OUTCOMES)
-    for outcome in known:
-        if outcome.name == name:
-            return outcome
-    plugin = load_entry_point(ENTRY_POINT_GROUP, name)
-    if plugin is None:
-        names = [*(o.name for o in known), *list_entry_points(ENTRY_POINT_GROUP)]
-        raise InputError("no such outcome", key="outcomes", value=name, remedy=suggest(name, names))
-    if not isinstance(plugin, Outcome):
-        entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
-        problem = f"expected an Outcome, got {type(plugin).__name__}"
-        raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
-    for variable in plugin.variables:
-        if np.dtype(variable.dtype).kind != "f" or not set(variable.dims) <= set(CURVE_DIMS):
-            entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
-            problem = f"variable {variable.name}: dtype a float, dims of {', '.join(CURVE_DIMS)}"
-            raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
-    return plugin

@@ -1,21 +1,26 @@
 """A study with all that it names: test, model, outcomes; checked before anything is computed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+
 from table_io.config.base import parse_toml, read_text
 from table_io.config.folders import find_config, resolve_config
+from table_io.config.plugins import list_entry_points, load_entry_point, make_plugin_error
 from table_io.config.profile import Profile, load_profile
 from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.stepped_sine import validate_frequencies
 from twin.setup.run_config import read_model
+from twin.studies.maps.branch_outcomes import BRANCH_OUTCOMES
 from twin.studies.maps.cases import CaseFactory, SampledCase
 from twin.studies.maps.config import StudyConfig
-from twin.studies.maps.outcomes import Outcome, OutcomeVariable, find_outcome
+from twin.studies.maps.outcomes import CURVE_DIMS, ENTRY_POINT_GROUP, Outcome, OutcomeVariable
+from twin.studies.maps.sweep_outcomes import SWEEP_OUTCOMES
 
 
 @dataclass(frozen=True)
@@ -171,3 +176,25 @@ class Study:
                 value=front.each,
                 remedy=suggest(front.each, parameters),
             )
+
+
+def find_outcome(name: str) -> Outcome:
+    """Return an outcome, built-in before plug-in; InputError names the nearest."""
+    known: Iterable[Outcome] = (*SWEEP_OUTCOMES, *BRANCH_OUTCOMES)
+    for outcome in known:
+        if outcome.name == name:
+            return outcome
+    plugin = load_entry_point(ENTRY_POINT_GROUP, name)
+    if plugin is None:
+        names = [*(o.name for o in known), *list_entry_points(ENTRY_POINT_GROUP)]
+        raise InputError("no such outcome", key="outcomes", value=name, remedy=suggest(name, names))
+    if not isinstance(plugin, Outcome):
+        entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
+        problem = f"expected an Outcome, got {type(plugin).__name__}"
+        raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
+    for variable in plugin.variables:
+        if np.dtype(variable.dtype).kind != "f" or not set(variable.dims) <= set(CURVE_DIMS):
+            entry = list_entry_points(ENTRY_POINT_GROUP)[name][0]
+            problem = f"variable {variable.name}: dtype a float, dims of {', '.join(CURVE_DIMS)}"
+            raise make_plugin_error(entry, ENTRY_POINT_GROUP, problem)
+    return plugin
