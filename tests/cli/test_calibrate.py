@@ -207,7 +207,7 @@ def test_what_cannot_be_is_refused_and_leaves_no_record(
 
 
 CARD = parse_toml(TEXT, RigConfig, "card").sensors[2]
-ASKED = command.CalibrationRequest(CARD.channel, "simulated", "0,1", False, None, 0.0, True, None)
+ASKED = command.CalibrationOptions(CARD.channel, "simulated", "0,1")
 
 
 @pytest.mark.parametrize("turned", [1.0, -1.0])
@@ -341,7 +341,7 @@ def test_a_person_presses_enter_and_an_unattended_table_waits(
     prompts: list[str] = []
     monkeypatch.setattr(command, "RealClock", lambda: clock)
     monkeypatch.setattr(builtins, "input", prompts.append)
-    command._wait_for_person("apply 1 g", unattended)
+    (command.wait_for_table if unattended else command.ask_person)("apply 1 g")
     assert clock.now() == (8.0 if unattended else 3.0)
     assert len(prompts) == (0 if unattended else 1)
 
@@ -352,7 +352,7 @@ def test_without_a_terminal_nobody_can_be_prompted(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(builtins, "input", end)
     with raises_input_error(remedy="--unattended"):
-        command._wait_for_person("apply 1 g", False)
+        command.ask_person("apply 1 g")
 
 
 @pytest.mark.parametrize(

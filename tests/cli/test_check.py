@@ -15,7 +15,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
 from tests.command_line import call_main
-from twin.rig.check import find_worst_rows, print_plan, select_rows, sum_durations_s
+from twin.rig.check import check_config, find_worst_rows, print_plan, select_rows, sum_durations_s
 from twin.rig.drive_figure import draw_drive
 from twin.rig.predicted_ranges import format_clipping_warnings, predict_response
 from twin.setup.folders import make_output_folder, remove_empty_folders
@@ -47,7 +47,7 @@ def read_shipped(name: str) -> RunConfig:
 
 def format_plan(config: RunConfig) -> str:
     console = Console(width=80, record=True, file=StringIO())
-    print_plan(console, config)
+    print_plan(console, check_config(config))
     return console.export_text()
 
 

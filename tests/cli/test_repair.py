@@ -9,7 +9,7 @@ import pytest
 from tests.input_errors import raises_input_error
 from tests.recording.test_mcap_log import run, write
 from twin.replay import verify
-from twin.replay.verify import Verification, examine_logs, write_repaired
+from twin.replay.verify import Verification, examine_logs, repair_log
 
 
 @pytest.fixture
@@ -31,9 +31,9 @@ def test_a_full_disk_leaves_no_half_of_a_file(
     with monkeypatch.context() as patch:
         patch.setattr("twin.recording.mcap_log.os.write", full)
         with pytest.raises(OSError, match="No space left"):
-            write_repaired(verified, [old], new)
+            repair_log(verified, new)
     assert not new.exists()
-    write_repaired(verified, [old], new)
+    repair_log(verified, new)
     assert examine_logs([new]).report.damage == []
 
 
@@ -52,7 +52,7 @@ def test_repair_names_what_failed_first(
     monkeypatch.setattr("twin.recording.mcap_log.LogWriter.write", fails)
     monkeypatch.setattr("twin.recording.mcap_log.LogWriter.close", fails_then)
     with pytest.raises(OSError, match="the first"):
-        write_repaired(verified, [old], new)
+        repair_log(verified, new)
 
 
 def test_one_that_reads_back_as_another_is_not_left(
@@ -66,12 +66,12 @@ def test_one_that_reads_back_as_another_is_not_left(
 
     monkeypatch.setattr(verify, "examine_logs", forgetful)
     with raises_input_error(where=new, remedy=str(old)):
-        write_repaired(verified, [old], new)
+        repair_log(verified, new)
     assert not new.exists()
 
 
 def test_what_was_there_stays(old: Path) -> None:
     before = old.read_bytes()
     with raises_input_error(where=old):
-        write_repaired(examine_logs([old]), [old], old)
+        repair_log(examine_logs([old]), old)
     assert old.read_bytes() == before

@@ -19,8 +19,8 @@ from tests.command_line import call_main
 from tests.earthquakes.test_table_drive import RECORD, TWIN
 from twin.earthquakes.result import DriveResult, load_table_twin
 from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
-from twin.live.run_command import list_specimen_changes
 from twin.setup.run_config import read_run_config
+from twin.setup.warnings import list_specimen_changes
 from twin.system.files import hash_file
 
 RIG_TOML = (PROFILES_DIR / "rigs" / "hydraulic.toml").read_text(encoding="utf-8")

@@ -22,7 +22,7 @@ from twin.recording.reader import read_recording
 from twin.report.report import render_report
 from twin.results.report_data import build_report_data
 from twin.results.summary import summarise
-from twin.rig.check import print_plan
+from twin.rig.check import check_test, print_plan
 from twin.setup.run_config import read_model, read_run_config
 from twin.setup.unpaced import simulate_ideal
 from twin.simulation.command import simulate_profile
@@ -94,7 +94,7 @@ def list_exits(sweep: SteppedSineResponse) -> list[list[str]]:
 def format_check(profile: Path) -> str:
     """Return what `check` prints, in one line."""
     console = Console(width=400, record=True, file=StringIO())
-    print_plan(console, read_run_config(profile))
+    print_plan(console, check_test(profile))
     return " ".join(console.export_text().split())
 
 

@@ -61,9 +61,11 @@ def branches_command(
     out: OutOption = None,
 ) -> None:
     """Follow the periodic motions of the model, stable and unstable; locate bifurcations."""
-    from twin.branches.command import BranchRequest, show_branches
+    from twin.branches.command import show_branches
+    from twin.branches.task import BranchOptions
 
-    request = BranchRequest(
-        profile, model, gap, level, over, low, high, at, complete, attractors, basins, out
+    show_branches(
+        BranchOptions(
+            profile, model, gap, level, over, low, high, at, complete, attractors, basins, out
+        )
     )
-    raise typer.Exit(show_branches(request))

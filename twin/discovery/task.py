@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from table_io.clock import RealClock
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.discovery.build_verdict import (
     build_interval,
@@ -50,6 +51,9 @@ from twin.discovery.sensor_checks import check_sensors
 from twin.discovery.symbolic_regression import MISSING_MESSAGE, is_available
 from twin.laws.library import find_effect
 from twin.model.config import ModelConfig
+from twin.recording.reader import read_recording
+from twin.recording.run_paths import resolve_log_path
+from twin.results.recordings import build_provenance
 from twin.setup.run_config import read_model_template
 
 MIN_THREADED_SAMPLES = 120_000  # of all logs; with fewer, threads do not pay
@@ -164,7 +168,7 @@ def discover(
             )
         if proposals:
             proposed_profile = proposals[0].format_profile(decide.rig)
-    result = collect_result(discovery, prepared, config, verdict, law)
+    result = collect_result(discovery, prepared, config, verdict, law, format_provenance(paths))
     return replace(result, proposals=proposals, proposed_profile=proposed_profile)
 
 
@@ -174,12 +178,13 @@ def collect_result(
     config: ModelConfig,
     verdict: Verdict,
     law: LawProposal | None = None,
+    provenance_toml: str = "",
 ) -> DiscoveredModel:
     """Return a discovery with the texts of its files; `config` is the model as given."""
     model_toml, omitted = _format_discovered_model(discovery, logs, config, law)
     best = law.fitted if law else discovery.verdict.best
     return DiscoveredModel(
-        model_toml,
+        model_toml + provenance_toml,
         verdict.model_copy(update={"notes": [*verdict.notes, *omitted]}),
         discovery,
         tuple(logs),
@@ -205,6 +210,12 @@ def _format_discovered_model(
     title = f"{config.title}; {' + '.join(best.names) or 'nothing added'}"
     names = ", ".join(log.signals.name for log in logs)
     return format_fitted_model(best.fit, title, config.citation, names, provisional, best.names)
+
+
+def format_provenance(logs: Sequence[Path]) -> str:
+    """Return the table [provenance] of a model that was identified from recordings, as TOML."""
+    recordings = [read_recording(resolve_log_path(log), ()) for log in logs]
+    return format_toml({"provenance": build_provenance(recordings).model_dump()})
 
 
 @contextlib.contextmanager
@@ -289,6 +300,7 @@ def identify(
     log_parameters = {
         free.name: build_parameter(fit, free) for free in fit.free if get_log(free.key) is not None
     }
+    model_toml += format_provenance([Path(log) for log in logs])
     return FittedModel(model_toml, content, log_parameters, result)
 
 

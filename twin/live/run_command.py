@@ -4,12 +4,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from table_io.clock import RealClock, local_datetime
-from table_io.config.base import parse_toml
-from table_io.config.calibration import find_overdue_calibrations
-from table_io.config.profile import Specimen
-from table_io.safety.preflight import list_drive_warnings, list_setup_warnings
-from twin.model.config import ModelConfig
+from table_io.clock import RealClock
 from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
 from twin.security.credentials import Credentials, credentials_folder
 from twin.setup.disk import require_disk_space
@@ -17,6 +12,7 @@ from twin.setup.folders import RUNS_FOLDER, make_run_folder
 from twin.setup.realtime import check_full_speed, check_realtime
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.warm_up import compile_kernels
+from twin.setup.warnings import list_test_warnings
 from twin.system.progress import RunProgress
 from twin.system.terminal import catch_interrupts, console, print_line, show_status
 from twin.transport.endpoint import check_endpoint
@@ -50,13 +46,7 @@ def run_test(
     compile_kernels(config, table=True)
     require_disk_space([config], out or RUNS_FOLDER)
     folder, run_id = make_run_folder(out, config.name)
-    messages = (
-        *list_drive_warnings(config.margins, config.rig),
-        *list_setup_warnings(config.profile, config.rig),
-        *list_model_warnings(config.model_toml),
-        *list_specimen_changes(config.model_toml, config.profile.specimen),
-    )
-    for sentence in (*messages, *find_overdue_calibrations(config.rig, local_datetime().date())):
+    for sentence in list_test_warnings(config):
         print_line(f"warning: {sentence}")
     print_line(
         f"{config.profile.title}: {config.extent}, "
@@ -74,24 +64,6 @@ def run_test(
                     return EXIT_INTERRUPTED
         code = finalize_run(folder, config, view)
     return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
-
-
-def list_model_warnings(model_toml: str) -> list[str]:
-    """Return a warning for a model that its fit marked as provisional."""
-    model = parse_toml(model_toml, ModelConfig, "model")
-    return [f"the model is provisional: {model.provisional}"] if model.provisional else []
-
-
-def list_specimen_changes(model_toml: str, specimen: Specimen) -> list[str]:
-    """List how a specimen differs from those that a model was identified from."""
-    model = parse_toml(model_toml, ModelConfig, "model")
-    if model.provenance is None:
-        return []
-    what, gap_mm = f"the model {model.title!r}", 1e3 * sum(specimen.gaps_m)
-    return [
-        *model.provenance.list_mass_changes(specimen.mass_kg, what),
-        *model.provenance.list_bumper_changes(gap_mm, what),
-    ]
 
 
 def _run_unpaced(

@@ -128,17 +128,27 @@ class Verification:
 
 def verify_logs(logs: list[Path], as_json: bool, repair: Path | None) -> int:
     """Verify a log or its parts, print the report, repair if asked; return the exit code."""
-    paths = [part for log in logs for part in list_parts(log)]
-    verification = examine_logs(paths, [message for log in logs if (message := scattered(log))])
+    verification = verify(*logs)
     if as_json:
         print(dump_strict_json(asdict(verification.report)))
     else:
         print_verification(verification.report, advise=repair is None)
     if repair is not None:
-        sentence = write_repaired(verification, paths, repair)
+        sentence = repair_log(verification, repair)
         if not as_json:
             print_line(f"repaired -> {repair}: {sentence}")
     return 0 if verification.report.sound else EXIT_GAPS
+
+
+def verify(*logs: str | Path) -> Verification:
+    """Verify that a recording, in a log, a run's folder or parts, is whole and can be replayed.
+
+    `repair_log(verification, new)` writes what is left of a damaged one to a new log. InputError if
+    no recording can be read.
+    """
+    folders = [Path(log) for log in logs]
+    paths = [part for folder in folders for part in list_parts(folder)]
+    return examine_logs(paths, [text for folder in folders if (text := scattered(folder))])
 
 
 def examine_logs(paths: list[Path], unmerged: Sequence[str] = ()) -> Verification:
@@ -406,9 +416,11 @@ def _print_limited(label: str, lines: list[str]) -> None:
         print_line(f"{label}: and {len(lines) - MAX_LISTED} more; see --json")
 
 
-def write_repaired(verification: Verification, paths: list[Path], new: Path) -> str:
+def repair_log(verification: Verification, new: str | Path) -> str:
     """Write the readable messages of a log to `new`, verify it, and return a summary."""
+    new = Path(new)
     recording = verification.recording
+    paths = [Path(path) for path in verification.report.log]
     gaps = find_unrecorded_gaps(recording)
     event = Event(
         0,

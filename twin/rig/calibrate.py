@@ -4,6 +4,7 @@ The inputs are read as for a tare; no command is queued and no output is started
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -31,17 +32,21 @@ MIN_SPAN_SIGMA = 10.0  # standard errors, to be spanned by the readings
 
 
 @dataclass(frozen=True, slots=True)
-class CalibrationRequest:
-    """Options of the command."""
+class CalibrationOptions:
+    """Channel and rig of a sensor, and how it is calibrated: by applied values or its shunt.
+
+    `points`: applied values in the unit of the channel, separated by commas, and `applied_sd` their
+    standard uncertainty. `tolerance_percent`: of the sensitivity; None: the default, or that of the
+    shunt. `out`: the record; None: next to the rig file.
+    """
 
     channel: str
     table: str
-    points: str
-    shunt: bool
-    tolerance_percent: float | None  # None: the default, or that of the shunt
-    applied_sd: float
-    unattended: bool
-    out: Path | None
+    points: str = ""
+    shunt: bool = False
+    tolerance_percent: float | None = None
+    applied_sd: float = 0.0
+    out: Path | None = None
 
     @property
     def tolerance(self) -> float:
@@ -51,29 +56,46 @@ class CalibrationRequest:
         )
 
 
-def calibrate_sensor(request: CalibrationRequest) -> int:
-    """Measure each point and write the record; return 0, or 2 if out of tolerance."""
-    path = find_config(request.table, "rigs", option="--table")
+@dataclass(frozen=True, eq=False)
+class CalibratedSensor:
+    """Record of a calibration, its file, and the sensor as the rig file states it."""
+
+    record: CalibrationRecord
+    path: Path
+    sensor: SensorConfig
+
+
+def calibrate(
+    options: CalibrationOptions,
+    ask: Callable[[str], None],
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> CalibratedSensor:
+    """Measure the sensitivity of a sensor; write the record and compare it with the rig file.
+
+    `ask` is told what to apply, and returns when it is applied; `tell` gets each reading. No output
+    is started. InputError if the sensor does not respond to what is applied.
+    """
+    path = find_config(options.table, "rigs", option="--table")
     rig, _ = load_rig(path)
     sensor = next(
-        (candidate for candidate in rig.sensors if candidate.channel == request.channel), None
+        (candidate for candidate in rig.sensors if candidate.channel == options.channel), None
     )
     if sensor is None:
         raise InputError(
             f"rig {rig.name} has no sensor of this channel",
-            where=request.channel,
-            remedy=suggest(request.channel, rig.channels),
+            where=options.channel,
+            remedy=suggest(options.channel, rig.channels),
         )
-    applied, prompts = _plan_points(request, sensor)
+    applied, prompts = _plan_points(options, sensor)
     timestamp = f"{local_datetime():%Y%m%d-%H%M%S}"
-    if request.out is None and path.resolve().is_relative_to(PROFILES_DIR):
+    if options.out is None and path.resolve().is_relative_to(PROFILES_DIR):
         raise InputError(
             "this rig file comes with shaketwin; records are kept next to a rig file of your own",
             key="--table",
-            value=request.table,
+            value=options.table,
             remedy="make one with `shaketwin new rig FILE`, or name a file with --out",
         )
-    record_path = request.out or calibrations_dir(path) / f"{timestamp}-{sensor.channel}.toml"
+    record_path = options.out or calibrations_dir(path) / f"{timestamp}-{sensor.channel}.toml"
     if record_path.exists():
         raise InputError(
             "exists; records are never overwritten",
@@ -82,37 +104,44 @@ def calibrate_sensor(request: CalibrationRequest) -> int:
         )
     means = []
     for prompt in prompts:
-        _wait_for_person(prompt, request.unattended)
+        ask(prompt)
         means.append(_measure_mean(rig, sensor, prompt))
-        print_line(f"  {means[-1].volts:.6g} V +- {means[-1].sd:.2g} V")
-    record = make_calibration(sensor, request, applied, tuple(means))
+        tell(f"  {means[-1].volts:.6g} V +- {means[-1].sd:.2g} V")
+    record = make_calibration(sensor, options, applied, tuple(means))
     _write_record(record_path, record)
-    _print_record(record, sensor, record_path)
-    return 0 if record.passed else EXIT_FAILED
+    return CalibratedSensor(record, record_path, sensor)
+
+
+def print_calibration(options: CalibrationOptions, unattended: bool) -> int:
+    """Calibrate a sensor and print the record; return 0, or 2 if out of tolerance."""
+    ask = wait_for_table if unattended else ask_person
+    calibrated = calibrate(options, ask, print_line)
+    _print_record(calibrated.record, calibrated.sensor, calibrated.path)
+    return 0 if calibrated.record.passed else EXIT_FAILED
 
 
 def _plan_points(
-    request: CalibrationRequest, sensor: SensorConfig
+    options: CalibrationOptions, sensor: SensorConfig
 ) -> tuple[tuple[float, ...], list[str]]:
     """Return (applied values in the sensor's unit, prompts to the operator), by point."""
-    if not 0 < request.tolerance < math.inf:
+    if not 0 < options.tolerance < math.inf:
         raise InputError(
-            "out of range", where=f"--tolerance {request.tolerance:g}", allowed="above 0 %"
+            "out of range", where=f"--tolerance {options.tolerance:g}", allowed="above 0 %"
         )
-    if not 0 <= request.applied_sd <= sensor.range:
+    if not 0 <= options.applied_sd <= sensor.range:
         raise InputError(
             "out of range",
-            where=f"--applied-sd {request.applied_sd:g}",
+            where=f"--applied-sd {options.applied_sd:g}",
             allowed=f"0 to {sensor.range:g} {sensor.unit}, the range of the sensor",
         )
-    if request.shunt:
-        if request.tolerance_percent is not None:
+    if options.shunt:
+        if options.tolerance_percent is not None:
             raise InputError(
                 "does not apply to a shunt calibration",
                 where="--tolerance",
                 remedy="omit it: shunt_tolerance in the [[sensors]] table of the rig file applies",
             )
-        if request.points:
+        if options.points:
             raise InputError(
                 "does not apply to a shunt calibration",
                 where="--points",
@@ -128,13 +157,13 @@ def _plan_points(
         _check_span((0.0, sensor.shunt), sensor, "shunt")
         return (0.0, sensor.shunt), prompts
     try:
-        applied = tuple(float(text) for text in request.points.split(","))
+        applied = tuple(float(text) for text in options.points.split(","))
     except ValueError:
         applied = ()
     if len(set(applied)) < 2 or not all(abs(value) <= sensor.range for value in applied):
         raise InputError(
             "not a list of applied values",
-            where=f"--points {request.points}".rstrip(),
+            where=f"--points {options.points}".rstrip(),
             allowed=f"at least two different numbers in {sensor.unit}, within "
             f"+-{sensor.range:g}, such as 0,{0.5 * sensor.range:g}",
             remedy="or calibrate by the shunt with --shunt",
@@ -154,13 +183,15 @@ def _check_span(applied: tuple[float, ...], sensor: SensorConfig, option: str) -
         )
 
 
-def _wait_for_person(prompt: str, unattended: bool) -> None:
-    """Prompt the operator and wait for Enter, or `PAUSE_S` if unattended."""
-    if unattended:
-        print_line(f"{prompt}: measured in {PAUSE_S:g} s")
-        clock = RealClock()
-        clock.wait_until(clock.now() + PAUSE_S)
-        return
+def wait_for_table(prompt: str) -> None:
+    """Print what is to be applied and wait `PAUSE_S` for it."""
+    print_line(f"{prompt}: measured in {PAUSE_S:g} s")
+    clock = RealClock()
+    clock.wait_until(clock.now() + PAUSE_S)
+
+
+def ask_person(prompt: str) -> None:
+    """Prompt the operator and wait for Enter."""
     try:
         input(f"{prompt}, press Enter ")
     except EOFError:
@@ -204,7 +235,7 @@ def _measure_mean(rig: RigConfig, sensor: SensorConfig, prompt: str) -> MeanVolt
 
 def make_calibration(
     sensor: SensorConfig,
-    request: CalibrationRequest,
+    options: CalibrationOptions,
     applied: tuple[float, ...],
     means: tuple[MeanVoltage, ...],
 ) -> CalibrationRecord:
@@ -223,12 +254,12 @@ def make_calibration(
         )
     min_sd_v = lsb_v / math.sqrt(12.0)  # quantization error of each point
     weighted_means = tuple(MeanVoltage(mean.volts, max(mean.sd, min_sd_v)) for mean in means)
-    fit = fit_calibration(applied, request.applied_sd, weighted_means)
+    fit = fit_calibration(applied, options.applied_sd, weighted_means)
     nominal = sensor.volts_per_unit
     departure_percent = 100.0 * (fit.volts_per_unit / nominal - 1.0)
     sd = fit.volts_per_unit_sd
-    tolerance_percent = request.tolerance
-    if request.shunt and sensor.shunt is not None and sensor.shunt_tolerance is not None:
+    tolerance_percent = options.tolerance
+    if options.shunt and sensor.shunt is not None and sensor.shunt_tolerance is not None:
         tolerance_percent = 100.0 * sensor.shunt_tolerance / abs(sensor.shunt)
     return CalibrationRecord(
         channel=sensor.channel,
@@ -236,9 +267,9 @@ def make_calibration(
         serial=sensor.serial,
         at=local_datetime().isoformat(timespec="seconds"),
         by=user_name(None),
-        method="shunt" if request.shunt else "points",
+        method="shunt" if options.shunt else "points",
         applied=applied,
-        applied_sd=request.applied_sd,
+        applied_sd=options.applied_sd,
         volts=tuple(mean.volts for mean in means),
         volts_sd=tuple(mean.sd for mean in means),
         volts_per_unit=fit.volts_per_unit,

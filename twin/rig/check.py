@@ -1,7 +1,7 @@
 """`check PROFILE`: the plan with its margins, and the predicted sensor peaks."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +12,7 @@ from rich.table import Table
 from table_io.adaptive.policy import describe_adaptive_test
 from table_io.backends import open_backend
 from table_io.block import Label
-from table_io.clock import ManualClock, local_datetime
-from table_io.config.calibration import find_overdue_calibrations
+from table_io.clock import ManualClock
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.excitation.stepped_sine import Sweep
@@ -24,9 +23,7 @@ from table_io.safety.preflight import (
     CORRECTION_HEADROOM,
     RigLimit,
     StepDemand,
-    list_drive_warnings,
     list_limits,
-    list_setup_warnings,
 )
 from table_io.units import GRAVITY_M_S2
 from twin.rig.drive_figure import draw_drive
@@ -34,36 +31,64 @@ from twin.rig.predicted_ranges import PredictedPeak, format_clipping_warnings, p
 from twin.setup.disk import planned_bytes
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import RunConfig, make_run_id, read_run_config
+from twin.setup.warnings import list_test_warnings
 from twin.system.terminal import console, print_line, print_table
 
 MAX_STEP_ROWS = 12  # frequencies in the table of steps
 
 
-def check_profile(profile: Path, table: str | None, out: Path | None) -> None:
-    """Print the plan and its margins; draw the drive if `out` is given."""
-    config = read_run_config(profile, table)
-    print_plan(console, config)
+@dataclass(frozen=True, eq=False)
+class CheckedTest:
+    """Test that nothing prevents: its configuration, predicted peaks of its sensors, warnings.
+
+    `config.margins` are the demands of each step on the rig.
+    """
+
+    config: RunConfig
+    peaks: tuple[PredictedPeak, ...]
+    warnings: tuple[str, ...]
+
+
+def check_test(
+    profile: str | Path, table: str | Path | None = None, model: str | Path | None = None
+) -> CheckedTest:
+    """Check a test before anything moves, as `run` does, on the rig of its profile or `table`.
+
+    InputError for a faulty file, and if the test exceeds a limit of the rig.
+    """
+    names = (None if name is None else str(name) for name in (table, model))
+    return check_config(read_run_config(Path(profile), *names))
+
+
+def check_config(config: RunConfig) -> CheckedTest:
+    """Predict the response of a test; return it with all that is doubtful about the test."""
+    predicted = predict_response(config)
+    warnings = (
+        *list_test_warnings(config),
+        *format_clipping_warnings(predicted.peaks, config.rig),
+        *predicted.range_exits,
+    )
+    return CheckedTest(config, predicted.peaks, warnings)
+
+
+def print_check(profile: Path, table: str | None, out: Path | None) -> None:
+    """Check a test; print the plan and its margins; draw the drive if `out` is given."""
+    checked = check_test(profile, table)
+    print_plan(console, checked)
     if out is not None:
-        folder = make_output_folder(out, make_run_id(config.name))
-        print_line(f"drive drawn: {draw_drive(config, folder / 'drive.png')}")
+        folder = make_output_folder(out, make_run_id(checked.config.name))
+        print_line(f"drive drawn: {draw_drive(checked.config, folder / 'drive.png')}")
 
 
-def print_plan(console: Console, config: RunConfig) -> None:
+def print_plan(console: Console, checked: CheckedTest) -> None:
     """Print the plan of a test: steps, duration, buffer, and margins to the rig's limits."""
+    config = checked.config
     console.print(config.profile.title, style="bold", highlight=False)
     for name, text in _plan_lines(config):
         console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
-    predicted = predict_response(config)
     print_table(console, _make_steps_table(config))
-    print_table(console, _make_sensors_table(config, predicted.peaks))
-    messages = [
-        *list_drive_warnings(config.margins, config.rig),
-        *list_setup_warnings(config.profile, config.rig),
-        *format_clipping_warnings(predicted.peaks, config.rig),
-        *predicted.range_exits,
-        *find_overdue_calibrations(config.rig, local_datetime().date()),
-    ]
-    for sentence in messages:
+    print_table(console, _make_sensors_table(config, checked.peaks))
+    for sentence in checked.warnings:
         console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
     console.print("ready: nothing exceeds the limits of the rig file", highlight=False)
 

@@ -8,6 +8,7 @@ import contextlib
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Protocol, TypeGuard
 
 import numpy as np
@@ -22,11 +23,13 @@ from table_io.backends import (
     open_source,
 )
 from table_io.block import Float2D
-from table_io.clock import Clock, local_datetime
+from table_io.clock import Clock, ManualClock, RealClock, local_datetime
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.calibration import find_overdue_calibrations
+from table_io.config.folders import find_config
 from table_io.config.profile import AcquisitionConfig, Profile
 from table_io.config.rig import RigConfig
+from table_io.config.rig_file import load_rig
 from table_io.safety.wiring_check import (
     CheckLine,
     RestingInputs,
@@ -42,8 +45,10 @@ from table_io.safety.wiring_check import (
     list_stimuli,
     mark_untested,
 )
+from twin.live.process_config import request_realtime
 
 EXIT_FAILED = 2
+CHECK_PRIORITY = 50  # as for a rig: the machine's watchdog acts on a silent client
 TARE_S, REST_S, BLOCK_S = 1.0, 4.0, 0.02
 # Phases of a stimulus by hand: see `_record_response`.
 SETTLE_S, PRE_TRIGGER_S, STIMULUS_TIMEOUT_S, POST_TRIGGER_S = 1.0, 0.4, 30.0, 0.8
@@ -78,6 +83,25 @@ class WiringCheckResult:
     @property
     def has_passed(self) -> bool:
         return all(line.verdict != "fail" for line in self.lines)
+
+
+def check_table(
+    table: str | Path,
+    operator: Operator | None = None,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> WiringCheckResult:
+    """Check the wiring of a table at rest; with an operator also by hand. Nothing is driven.
+
+    `tell` gets a sentence before the machine is opened. A simulated table has no operator.
+    """
+    rig, _ = load_rig(find_config(str(table), "rigs", option="--table"))
+    clock: Clock = ManualClock() if rig.runs_at_any_speed else RealClock()
+    tell(f"{rig.title}: at rest, for {TARE_S + REST_S:g} s; keep away from the table")
+    if rig.runs_at_any_speed:
+        operator = None
+    else:
+        request_realtime(CHECK_PRIORITY)
+    return examine_wiring(rig, clock, make_machine(rig, clock), operator or False)
 
 
 def make_machine(rig: RigConfig, clock: Clock) -> Backend | AcquisitionSource:

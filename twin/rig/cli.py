@@ -84,13 +84,13 @@ def check_command(
     table and the mass; the table is not driven.
     """
     if profile is not None and not (unattended or json):
-        from twin.rig.check import check_profile
+        from twin.rig.check import print_check
 
-        check_profile(profile, table, out)
+        print_check(profile, table, out)
     elif profile is None and table is not None and out is None:
-        from twin.rig.wiring_table import check_wiring
+        from twin.rig.wiring_table import print_wiring_check
 
-        raise typer.Exit(check_wiring(table, unattended, json))
+        raise typer.Exit(print_wiring_check(table, unattended, json))
     else:
         raise InputError(
             "these arguments do not go together",
@@ -133,12 +133,10 @@ def calibrate_command(
 
     Leaves a dated record, which goes into every recording from then on; the rig file is not edited.
     """
-    from twin.rig.calibrate import CalibrationRequest, calibrate_sensor
+    from twin.rig.calibrate import CalibrationOptions, print_calibration
 
-    request = CalibrationRequest(
-        channel, table, points, shunt, tolerance, applied_sd, unattended, out
-    )
-    raise typer.Exit(calibrate_sensor(request))
+    options = CalibrationOptions(channel, table, points, shunt, tolerance, applied_sd, out)
+    raise typer.Exit(print_calibration(options, unattended))
 
 
 def devices_command(

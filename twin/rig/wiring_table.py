@@ -8,36 +8,19 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from table_io.clock import Clock, ManualClock, RealClock
-from table_io.config.folders import find_config
-from table_io.config.rig_file import load_rig
 from table_io.safety.wiring_check import CheckLine, RestingInputs
-from twin.live.process_config import request_realtime
 from twin.results.summary import dump_strict_json
-from twin.rig.check_table import (
-    EXIT_FAILED,
-    REST_S,
-    TARE_S,
-    WiringCheckResult,
-    examine_wiring,
-    make_machine,
-)
+from twin.rig.check_table import EXIT_FAILED, WiringCheckResult, check_table
 from twin.system.terminal import console, print_line, print_table
 
-CHECK_PRIORITY = 50  # as for a rig: the machine's watchdog acts on a silent client
 
-
-def check_wiring(table: str, unattended: bool, as_json: bool) -> int:
+def print_wiring_check(table: str, unattended: bool, as_json: bool) -> int:
     """Check the wiring and print the result; return 0, or 2 if a line fails."""
-    rig, _ = load_rig(find_config(table, "rigs", option="--table"))
-    clock: Clock = ManualClock() if rig.runs_at_any_speed else RealClock()
-    has_operator = sys.stdin.isatty() and not (unattended or as_json or rig.runs_at_any_speed)
-    if not as_json:
-        print_line(f"{rig.title}: at rest, for {TARE_S + REST_S:g} s; keep away from the table")
-    if not rig.runs_at_any_speed:
-        request_realtime(CHECK_PRIORITY)
-    result = examine_wiring(
-        rig, clock, make_machine(rig, clock), has_operator and TerminalOperator()
+    has_operator = sys.stdin.isatty() and not (unattended or as_json)
+    result = check_table(
+        table,
+        TerminalOperator() if has_operator else None,
+        (lambda _: None) if as_json else print_line,
     )
     print_wiring_result(result, as_json)
     return 0 if result.has_passed else EXIT_FAILED

@@ -1,5 +1,7 @@
 """Progress of a run on the terminal: one line per step, and a progress bar."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from types import TracebackType
 
 from rich.console import Console
@@ -39,6 +41,14 @@ TABLE_HEADER = (
 )
 # 10 s at 2 kHz: a channel that is off its range is so in every cycle, also of a slow motion.
 GAP_SERIES_SAMPLES = 20_000
+
+# Of a task: it enters the context while a stage is computed that the sentence describes.
+OpenStage = Callable[[str], AbstractContextManager[None]]
+
+
+def open_silently(_: str) -> AbstractContextManager[None]:
+    """Announce no stage."""
+    return nullcontext()
 
 
 def make_task_bar(*columns: ProgressColumn) -> Progress:
