@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+import tomllib
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ import pytest
 from table_io.block import Block
 from table_io.config.toml_text import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
-from tests.studies.blind.rig_setup import NOMINAL_RIG
+from tests.builders.rigs import RIG_TEXT
 from twin.compare.monitoring.cycle import ChannelNoise
 from twin.recording.reader import read_recording
 from twin.results.summary import Json, summarise, write_summary
@@ -59,16 +60,17 @@ def run_test(
     folder: Path, sweep: dict[str, float], truth: str = "", laser_range_mm: float = 100.0
 ) -> Json:
     """Summary of a run on a rig that hides a truth, as written."""
-    simulated = dict(NOMINAL_RIG["simulated"])
+    rig = tomllib.loads(RIG_TEXT)
+    simulated = rig["simulated"]
     if truth:
         (folder / "truth.toml").write_text(truth)
         digest = hashlib.sha256(truth.encode()).hexdigest()
         simulated |= {"truth": str(folder / "truth.toml"), "truth_sha256": digest}
     sensors = [
         sensor | ({"range": laser_range_mm} if sensor["channel"] == "mass_disp_m" else {})
-        for sensor in NOMINAL_RIG["sensors"]
+        for sensor in rig["sensors"]
     ]
-    rig = NOMINAL_RIG | {"simulated": simulated, "sensors": sensors}
+    rig |= {"simulated": simulated, "sensors": sensors}
     (folder / "rig.toml").write_text(format_toml(rig))
     (folder / "test.toml").write_text(TEST.format(name="test", rig=folder / "rig.toml", **sweep))
     config = read_run_config(folder / "test.toml")

@@ -10,27 +10,29 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.errors import InputError
-from tests.studies.blind.command import run_discovery_study
-from tests.studies.blind.decisive_runs import FIRST_TESTS, run_decide_study
+from tests.studies.blind.cases import LABORATORY_LEVELS
+from tests.studies.blind.decide_study import FIRST_TESTS, run_decide_study
+from tests.studies.blind.discovery_study import run_discovery_study
+from tests.studies.blind.harness import StudyOptions
 from tests.studies.blind.law_study import run_law_study
-from tests.studies.blind.strata import LABORATORY_LEVELS
 from twin.system.terminal import print_line
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Run a study; return its exit code, 2 for bad input."""
     given = make_parser().parse_args(words)
-    common = (given.out, given.seeds, given.cells or [], given.workers, given.resume)
+    scheduler = given.scheduler if given.study == "discovery" else ""
+    options = StudyOptions(
+        given.out, given.seeds, given.cells or [], given.workers, given.resume, scheduler
+    )
     try:
         match given.study:
             case "discovery":
-                return run_discovery_study(
-                    *common, given.controls, given.laboratory, given.scheduler
-                )
+                return run_discovery_study(options, given.laboratory, given.controls)
             case "decide":
-                return run_decide_study(*common, given.first)
+                return run_decide_study(options, given.first)
             case _:
-                return run_law_study(*common, given.rig, given.rivals)
+                return run_law_study(options, given.rig, given.rivals)
     except InputError as error:
         print_line(str(error))
         return 2

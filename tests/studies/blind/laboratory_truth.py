@@ -20,8 +20,8 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.sim.imperfections import Imperfection, resolve_sides
-from tests.studies.blind.amplitude_search import evaluate_residual
-from tests.studies.blind.rig_setup import PROFILE, StudySignals
+from tests.studies.blind.rig import PROFILE, StudySignals
+from tests.studies.blind.sizes import evaluate_residual
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""`shaketwin study laws`: laws for what no library holds, on the blind cases; resumable.
+"""Study of laws for what no library holds, on the blind cases.
 
 The library is not tried first: what is judged is the law alone, from the refitted base. The same
 hidden plant then plays two tests more, without noise: one 25 % stronger, along whose motion the
@@ -13,7 +13,7 @@ which it leads, and what dies away slowly after a jump are not those of a nearly
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,23 +25,14 @@ from table_io.clock import RealClock, cpu_seconds
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
-from tests.studies.blind.adapter import load_case
-from tests.studies.blind.baselines import describe_missing, find_baselines
-from tests.studies.blind.command import open_study_folder, parse_cases, run_cases
-from tests.studies.blind.evaluation import run_method, select_case_facts
-from tests.studies.blind.generation import CasePaths, generate_case, hash_truth, record_test
-from tests.studies.blind.rates import Rate, select_latest
-from tests.studies.blind.report import RESULTS_FILE, read_rows
-from tests.studies.blind.rig_setup import (
-    PROFILE,
-    PROFILE_TOML,
-    StudySignals,
-    add_hydraulic_instruments,
-    make_hydraulic_rig_toml,
-    make_rig_toml,
-    simulate_signals,
-)
-from tests.studies.blind.strata import Case, draw_case
+from tests.studies.blind.cases import draw_case
+from tests.studies.blind.discovery_study import run_method
+from tests.studies.blind.harness import RESULTS_FILE, Study, StudyOptions, read_rows, run_study
+from tests.studies.blind.metrics import Rate, select_kind, select_latest
+from tests.studies.blind.plant import SealedPlant, describe_end, generate_case
+from tests.studies.blind.rig import MODEL_TOML, PROFILE, PROFILE_TOML, StudySignals
+from tests.studies.blind.rivals import describe_missing, find_rivals, load_case
+from tests.studies.blind.scoring import select_case_facts
 from twin.discovery.discover import prepare_problem
 from twin.discovery.law_search import LawProposal, find_law_of_base
 from twin.discovery.law_terms import LAW_PREFIX
@@ -53,11 +44,10 @@ from twin.model.model import Model
 from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
 from twin.model.valid_range import find_range_exits
-from twin.system.process_pool import Workers
 from twin.system.terminal import print_line
 
 Json = dict[str, Any]
-DEFAULT_DIR, TABLE_FILE = Path("runs") / "study-laws", "laws.md"
+TABLE_FILE = "laws.md"
 DEFAULT_CELLS = ("unknown/*/3/1%", "unknown/*/3/5%", "single/appendage/3/*", "none/*")
 LEVEL_RATIO = 1.25  # ratio of the level of the test that leaves the fitted range
 MAX_FLOOR_RATIO, MAX_RATIO_OUTSIDE, MIN_CLOSED = 1.1, 3.0, 0.9
@@ -106,25 +96,13 @@ NO_PREDICTION: Mapping[str, Any] = {
 }  # fmt: skip
 
 
-def run_law_study(
-    out: Path | None,
-    seeds: int,
-    patterns: Sequence[str],
-    workers: int | None,
-    resume: bool,
-    rig: str = "simulated",
-    has_rivals: bool = False,
-) -> int:
+def run_law_study(options: StudyOptions, rig: str = "simulated", has_rivals: bool = False) -> int:
     """Evaluate the cases that have no result; return the exit code."""
-    numbers = parse_cases(seeds, patterns or DEFAULT_CELLS)
+    folder, numbers, workers = options.prepare("study-laws", DEFAULT_CELLS)
     if has_rivals and describe_missing():
         print_line(describe_missing())
-    folder = open_study_folder(out or DEFAULT_DIR, resume)
-    return run_cases(
-        folder, numbers, Workers.from_options(workers),
-        partial(evaluate_proposed_law, folder, rig, has_rivals),
-        RESULTS_FILE, format_law_row, write_page,
-    )  # fmt: skip
+    task = partial(evaluate_proposed_law, folder, rig, has_rivals)
+    return run_study(Study(task, format_law_row, write_page), folder, numbers, workers)
 
 
 def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -> Json:
@@ -135,11 +113,15 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
     row = select_case_facts(about) | {"label": case.label, "rig": rig}
     if not about["sized"]:
         return row
-    plant = _LawPlant(case, paths, rig)
-    row |= plant.record()
+    plant, folder = SealedPlant(case, paths.truth, rig), paths.case_dir
+    if rig != "simulated":
+        folder = paths.case_dir / rig
+        row["ended"] = describe_end(plant.record(folder / "log.mcap"))
+        row["sized"] = row["ended"] == "complete"
+        (folder / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
     if not row["sized"]:
         return row
-    logs, _, model = load_case(plant.folder)
+    logs, _, model = load_case(folder)
     clock = RealClock()
     start_s, start_cpu_s = clock.now(), cpu_seconds()
     prepared = prepare_problem(logs, model)
@@ -164,50 +146,13 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
             row |= {**NO_PREDICTION, "unusable": str(error)}
     if has_rivals:
         row["rivals"] = {}
-        for name, method in find_baselines().items():
-            verdict, failure = run_method(method, plant.folder)
+        for name, method in find_rivals().items():
+            verdict, failure = run_method(method, folder)
             row["rivals"][name] = {
                 "forces": None if failure else verdict["gap"]["held_out_after"],
                 "failed": failure,
             }
     return row
-
-
-class _LawPlant:
-    """The sealed plant of a case on a rig, which plays its recording and other tests."""
-
-    def __init__(self, case: Case, paths: CasePaths, rig: str) -> None:
-        self.case, self.rig, self._truth = case, rig, paths.sealed_dir / "truth.toml"
-        self._paths = paths
-        is_simulated = rig == "simulated"
-        self.folder = paths.case_dir if is_simulated else paths.case_dir / rig
-
-    def _make_rig(self, noise: float) -> str:
-        text = self._truth.read_text(encoding="utf-8")
-        if self.rig == "simulated":
-            truth = str(self._truth.resolve())
-            return make_rig_toml(noise, self.case.noise_seed, truth, hash_truth(text))
-        path = self._truth.with_name(f"truth_{self.rig}.toml")
-        text = add_hydraulic_instruments(text)
-        path.write_text(text, encoding="utf-8")
-        return make_hydraulic_rig_toml(self.case.noise_seed, str(path.resolve()), hash_truth(text))
-
-    def record(self) -> Json:
-        """Record the study's test on another rig than the simulated one; return how it ended."""
-        if self.rig == "simulated":
-            return {}
-        log = self.folder / "log.mcap"
-        self.folder.mkdir(exist_ok=True)
-        log.unlink(missing_ok=True)
-        model = (self._paths.case_dir / "model.toml").read_text(encoding="utf-8")
-        (self.folder / "model.toml").write_text(model, encoding="utf-8")
-        stop = record_test(self._make_rig(self.case.cell.noise), self.case.label, log, True)
-        is_complete = stop.verdict == "complete"
-        return {"sized": is_complete, "ended": f"{stop.verdict}: {stop.reason}"}
-
-    def simulate(self, profile: Profile) -> StudySignals:
-        """Return the true signals of a test."""
-        return simulate_signals(self._make_rig(0.0), profile)
 
 
 def _describe_terms(law: LawProposal | None) -> list[Json]:
@@ -230,7 +175,7 @@ def _measure_forces(residuals: LogResiduals, fitted: FittedSet) -> float:
 
 
 def _judge_predictions(
-    plant: _LawPlant, residuals: LogResiduals, null: FittedSet, best: FittedSet
+    plant: SealedPlant, residuals: LogResiduals, null: FittedSet, best: FittedSet
 ) -> Json:
     """Return the error in a stronger test, whether its range is said, and the gap in another."""
     stronger, unused = map(plant.simulate, (STRONGER_TEST, UNUSED_TEST))
@@ -385,10 +330,7 @@ def format_law_row(row: Json) -> str:
     text = " + ".join(term["force"] for term in row["law"]) or "no law"
     curve = row.get("curve")
     closed = f", curve {curve['before']:.3f} -> {curve['after']:.4f}" if curve else ""
-    return (
-        f"{row['cell']}: {row['before']:.3f} -> {row['after']:.3f}{closed} "
-        f"in {row['seconds']:.0f} s: {text}"
-    )
+    return f"{row['before']:.3f} -> {row['after']:.3f}{closed} in {row['seconds']:.0f} s: {text}"
 
 
 def write_page(folder: Path) -> Path:
@@ -410,13 +352,16 @@ def format_page(rows: Sequence[Json]) -> Iterator[str]:
     )
     yield "| quantity | goal | seen |"
     yield "|---|---|---|"
-    for name, goal, hits in _list_rates(usable):
-        flags = [*hits]
-        if flags:
-            yield f"| {name} | {goal} | {Rate(sum(flags), len(flags))} |"
-    for name, values in _list_times(usable):
-        if values:
-            yield f"| {name} | | median {np.median(values):.1f}, largest {max(values):.1f} |"
+    for name, goal, rate in _list_rates(usable):
+        if rate.count:
+            yield f"| {name} | {goal} | {rate} |"
+    searched = [row for row in usable if row["kind"] != "none"]
+    for name, key in (("processor time", "seconds"), ("wall clock", "wall_s")):
+        if values := [row[key] for row in searched]:
+            yield (
+                f"| {name} of the search in s | | "
+                f"median {np.median(values):.1f}, largest {max(values):.1f} |"
+            )
     yield "\n| case | held out over floor, before -> after | curves | outside | exact | law |"
     yield "|---|---|---|---|---|---|"
     for row in usable:
@@ -434,66 +379,61 @@ def _make_miss(row: Json) -> Json:
     }  # fmt: skip
 
 
-def _list_rates(rows: Sequence[Json]) -> Iterator[tuple[str, str, Iterator[bool]]]:
-    strangers = [row for row in rows if row["kind"] == "unknown"]
-    proposed = [row for row in rows if row["kind"] != "none" and row["law"]]
-    for noise in sorted({row["noise"] for row in strangers}):
-        own = [row for row in strangers if row["noise"] == noise]
-        title = f"laws outside the library, noise {100 * noise:g} %: held-out error of the law"
-        yield (
-            f"{title} <= {MAX_FLOOR_RATIO:g} x floor", ">= 85 %",
-            (bool(row["law"]) and row["after"] <= MAX_FLOOR_RATIO for row in own),
-        )  # fmt: skip
-        yield f"noise {100 * noise:g} %: a law proposed", "", (bool(row["law"]) for row in own)
+def _list_rates(rows: Sequence[Json]) -> Iterator[tuple[str, str, Rate]]:
+    """Yield (quantity, goal, rate) in the order of the page."""
     searched = [row for row in rows if row["kind"] != "none"]
-    yield (
-        f"search <= {MAX_SECONDS:g} s of processor time", "",
-        (row["seconds"] <= MAX_SECONDS for row in searched),
-    )  # fmt: skip
-    yield (
-        f"a test 25 % stronger: error <= {MAX_RATIO_OUTSIDE:g} x floor, or said", ">= 90 %",
-        (
-            row["outside"]["error"] <= MAX_RATIO_OUTSIDE or bool(row["outside"]["said"])
-            for row in proposed
-        ),
-    )  # fmt: skip
-    yield (
-        f"a test 25 % stronger: error <= {MAX_RATIO_OUTSIDE:g} x floor", "",
-        (row["outside"]["error"] <= MAX_RATIO_OUTSIDE for row in proposed),
-    )  # fmt: skip
+    strangers = select_kind(rows, "unknown")
+    proposed = [row for row in searched if row["law"]]
     drawn = [row for row in proposed if row.get("curve")]
     curves = [row for row in drawn if row["curve"]["before"] >= MIN_CURVE_GAP]
+    names = ("appendage", "table_resonator", "cubic_appendage")
+    resonators = [row for row in searched if any(name in row["cell"] for name in names)]
+    stronger = f"a test 25 % stronger: error <= {MAX_RATIO_OUTSIDE:g} x floor"
+
+    def has_law(row: Json) -> bool:
+        return bool(row["law"])
+
+    def is_near_outside(row: Json) -> bool:
+        return bool(row["outside"]["error"] <= MAX_RATIO_OUTSIDE)
+
+    for noise in sorted({row["noise"] for row in strangers}):
+        own = [row for row in strangers if row["noise"] == noise]
+        at_noise = f"noise {100 * noise:g} %"
+        yield (
+            f"laws outside the library, {at_noise}: held-out error of the law "
+            f"<= {MAX_FLOOR_RATIO:g} x floor",
+            ">= 85 %",
+            Rate.of(own, lambda row: has_law(row) and row["after"] <= MAX_FLOOR_RATIO),
+        )
+        yield f"{at_noise}: a law proposed", "", Rate.of(own, has_law)
+    yield (
+        f"search <= {MAX_SECONDS:g} s of processor time", "",
+        Rate.of(searched, lambda row: row["seconds"] <= MAX_SECONDS),
+    )  # fmt: skip
+    yield (
+        f"{stronger}, or said", ">= 90 %",
+        Rate.of(proposed, lambda row: is_near_outside(row) or bool(row["outside"]["said"])),
+    )  # fmt: skip
+    yield stronger, "", Rate.of(proposed, is_near_outside)
     yield (
         f"gap closed in the steady steps of a run never used >= {MIN_CLOSED:g} (base misses "
         f">= {100 * MIN_CURVE_GAP:g} %; {len(proposed) - len(drawn)} without such steps)",
         ">= 85 %",
-        (1 - row["curve"]["after"] / row["curve"]["before"] >= MIN_CLOSED for row in curves),
-    )  # fmt: skip
-    yield (
-        "exact structure", "reported",
-        (bool(row.get("exact")) for row in searched),
-    )  # fmt: skip
-    yield (
-        "nothing hidden: a law proposed", "<= 2 %",
-        (bool(row["law"]) for row in rows if row["kind"] == "none"),
-    )  # fmt: skip
-    names = ("appendage", "table_resonator", "cubic_appendage")
-    resonators = [row for row in searched if any(name in row["cell"] for name in names)]
+        Rate.of(
+            curves, lambda row: 1 - row["curve"]["after"] / row["curve"]["before"] >= MIN_CLOSED
+        ),
+    )
+    yield "exact structure", "reported", Rate.of(searched, lambda row: bool(row.get("exact")))
+    yield "nothing hidden: a law proposed", "<= 2 %", Rate.of(select_kind(rows, "none"), has_law)
     yield (
         "attached resonator: all its numbers within 10 %", ">= 90 %",
-        (_is_resonator_right(row) for row in resonators),
+        Rate.of(resonators, _is_resonator_right),
     )  # fmt: skip
 
 
 def _is_resonator_right(row: Json) -> bool:
     errors = row.get("resonator") or {}
     return bool(errors) and max(map(abs, errors.values())) <= MAX_PARAMETER_ERROR
-
-
-def _list_times(rows: Sequence[Json]) -> Iterator[tuple[str, list[float]]]:
-    searched = [row for row in rows if row["kind"] != "none"]
-    yield "processor time of the search in s", [row["seconds"] for row in searched]
-    yield "wall clock of the search in s", [row["wall_s"] for row in searched]
 
 
 def _format_case(row: Json) -> str:
@@ -521,10 +461,11 @@ def _format_rivals(rows: Sequence[Json]) -> Iterator[str]:
     yield "\nHeld-out rms of the forces over the noise, on the same recordings.\n"
     yield f"| method | median | <= {MAX_FLOOR_RATIO:g} |"
     yield "|---|---|---|"
-    methods: dict[str, Callable[[Json], float | None]] = {"law search": lambda row: row["forces"]}
-    for name in compared[0]["rivals"]:
-        methods[name] = lambda row, name=name: row["rivals"].get(name, {}).get("forces")  # type: ignore[misc]
-    for name, read in methods.items():
-        values = [value for row in compared if (value := read(row)) is not None]
+    for name in ("law search", *compared[0]["rivals"]):
+        errors = [
+            row["forces"] if name == "law search" else row["rivals"].get(name, {}).get("forces")
+            for row in compared
+        ]
+        values = [error for error in errors if error is not None]
         hits = sum(value <= MAX_FLOOR_RATIO for value in values)
         yield f"| {name} | {np.median(values):.3f} | {Rate(hits, len(values))} |"

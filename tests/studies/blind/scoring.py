@@ -1,22 +1,53 @@
-"""Score of a verdict against the sealed truth: from verdict.json and about.json to a row. No I/O.
+"""Scores of verdicts against the sealed truth: from verdict.json and about.json to a row. No I/O.
 
 A verdict is right about an effect if it names its id, and for a sensor effect its channel.
+
+In an imperfect laboratory everything that a verdict names is one of
+
+    effect        hidden in the specimen, or a planted error of a sensor
+    instrument    a true instrument finding: an error of a sensor or of the set-up that the
+                  laboratory has, of the true kind, on the true channel, and of the true size. The
+                  size is true if it is within the stated interval, or within a factor of two of the
+                  error measured on a noise-free recording (`laboratory_truth`)
+    false         an error of a sensor or of the set-up that the laboratory does not have, or of
+                  another sign or size
+    physics       an effect of the specimen that is not there
+
+A verdict is healthy if it is `none`, or names true instrument findings only. What it lists without
+naming it (`unexplained`) is no finding. In a typical laboratory, whose instruments are sound, it
+must not call them to be mended either; in a bad one that is a finding on the channels it states.
 """
 
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from tests.studies.blind.metrics import MAX_PARAMETER_ERROR
+from twin.discovery.parameters import GAP_PREFIX
+
 Json = dict[str, Any]
-UNNAMED_CANDIDATES = (
-    "nothing",
-    "general",
-)  # candidates: base model alone, generic term
+UNNAMED_CANDIDATES = ("nothing", "general")  # candidates: base model alone, generic term
 SET_SEPARATOR = " + "  # between the names of a candidate with several effects
 # Forms of the simulated machine with the same law as the library: only these can be fitted exactly.
 LIBRARY_FORMS = frozenset({
     "ode", "stiffness", "shift", "linear", "sine", "mass", "gain", "delay", "after_tare",
 })  # fmt: skip
+SIZE_RATIO = 2.0  # of an instrument error named to the true one, either way
+VANISHING = {"gain": 1.0, "ratio": 1.0}  # values of parameters without an error; others: 0
+# Parameters in about.json, by their names in a verdict.
+BASE_KEYS = {
+    "stiffness": "damper_stiffness_n_m",
+    "damping": "damper_damping_n_s_m",
+    "bumper_stiffness": "bumper_stiffness_n_m",
+    "bumper_damping": "bumper_damping_n_s_m",
+}
+GAP_KEYS = {"right": "gap_right_m", "left": "gap_left_m"}
+CASE_KEYS = ("number", "cell", "kind", "noise", "size", "reached", "ended", "sized")
+
+
+def select_case_facts(about: Json) -> Json:
+    """Return what a row says of its case, whatever is judged."""
+    return {key: about[key] for key in CASE_KEYS}
 
 
 def format_effect_name(effect: Mapping[str, Any]) -> str:
@@ -36,33 +67,32 @@ def score_verdict(verdict: Json, about: Json, oracle: float | None = None) -> Js
     structure with fitted parameters.
     """
     word, truth = verdict["verdict"], [effect["name"] for effect in about["effects"]]
-    named = _select_named(verdict)
-    row: Json = {
-        "number": about["number"], "cell": about["cell"], "kind": about["kind"],
-        "truth": truth, "noise": about["noise"], "size": about["size"],
-        "reached": about["reached"], "ended": about["ended"],
-        "sized": about["sized"], "said": word, "named": named,
+    named, gap = _select_named(verdict), verdict.get("gap") or {}
+    row = select_case_facts(about) | {
+        "truth": truth, "said": word, "named": named,
         "ambiguous": verdict.get("ambiguous", []),
         "confidence": _top_confidence(verdict), "seconds": verdict.get("seconds"),
     }  # fmt: skip
-    row |= _SCORERS[about["kind"]](word, named, truth, verdict)
-    row["right"] = _is_right(row)
-    row["region"] = (
-        _is_region_right(verdict, about) if about["kind"] in ("single", "unknown") else None
-    )
-    row |= _score_gap(verdict.get("gap") or {}, oracle)
+    kind = about["kind"]
+    match kind:
+        case "none":
+            row["false_alarm"] = word != "none"
+            row["right"] = not row["false_alarm"]
+        case "unknown":
+            row |= {"unexplained": word == "unexplained", "wrong_name": word == "named"}
+            row["right"] = row["unexplained"]
+        case "pair":
+            hits = {*truth} & {*named}
+            row |= {"both": hits == {*truth}, "one": bool(hits), "extra": not {*named} <= {*truth}}
+            row["right"] = row["both"]
+        case _:  # top1: named first; exact: named alone; two: among the first two
+            row["top1"] = row["right"] = word == "named" and named[:1] == truth
+            row["exact"] = word == "named" and named == truth
+            row["two"] = truth[0] in _select_two(word, named, verdict)
+    row["region"] = _is_region_right(verdict, about) if kind in ("single", "unknown") else None
+    row |= _score_gap(gap, oracle)
     row["parameters"] = _score_parameters(verdict, about) if row["right"] and truth else []
-    return row
-
-
-def _score_single(word: str, named: list[str], truth: list[str], verdict: Json) -> Json:
-    """Score a single effect: `top1` named first, `exact` named alone, `two` among the first two."""
-    top1 = word == "named" and named[:1] == truth
-    return {
-        "top1": top1,
-        "exact": word == "named" and named == truth,
-        "two": truth[0] in _select_two(word, named, verdict),
-    }
+    return row | {"held_out": gap.get("held_out_after")}
 
 
 def _select_named(verdict: Json) -> list[str]:
@@ -101,34 +131,6 @@ def _select_two(word: str, named: list[str], verdict: Json) -> list[str]:
         ]
         names = [*named, *(name for name in single if SET_SEPARATOR not in name)]
     return list(dict.fromkeys(names))[:2]
-
-
-def _score_none(word: str, named: list[str], truth: list[str], verdict: Json) -> Json:
-    return {"false_alarm": word != "none"}
-
-
-def _score_unknown(word: str, named: list[str], truth: list[str], verdict: Json) -> Json:
-    return {"unexplained": word == "unexplained", "wrong_name": word == "named"}
-
-
-def _score_pair(word: str, named: list[str], truth: list[str], verdict: Json) -> Json:
-    hits = set(truth) & set(named)
-    return {"both": len(hits) == len(truth), "one": bool(hits), "extra": not {*named} <= {*truth}}
-
-
-_SCORERS = {
-    "single": _score_single,
-    "sensor": _score_single,
-    "none": _score_none,
-    "unknown": _score_unknown,
-    "pair": _score_pair,
-}
-
-
-def _is_right(row: Json) -> bool:
-    """Return whether the case is a hit, for the confusion matrix and the worst misses."""
-    key = {"none": "false_alarm", "unknown": "unexplained", "pair": "both"}.get(row["kind"], "top1")
-    return bool(row[key]) != (key == "false_alarm")
 
 
 def _top_confidence(verdict: Json) -> float | None:
@@ -183,19 +185,20 @@ def _score_parameters(verdict: Json, about: Json) -> list[Json]:
             estimate = estimates_by_effect.get(effect["name"], {}).get(name)
             if not isinstance(estimate, Mapping) or estimate.get("value") is None:
                 continue
-            scale = abs(true - (effect["vanishing"].get(name) or 0.0))
-            errors.append({
-                "name": f"{effect['name']}.{name}",
-                "error": abs(estimate["value"] - true) / scale if scale else math.inf,
-                "covered": _interval_covers(estimate, true),
-                "alike": effect.get("form") in LIBRARY_FORMS,
-            })  # fmt: skip
+            scale = true - (effect["vanishing"].get(name) or 0.0)
+            score = _score_estimate(f"{effect['name']}.{name}", estimate, true, scale)
+            errors.append(score | {"alike": effect.get("form") in LIBRARY_FORMS})
     return errors
 
 
-def _interval_covers(estimate: Mapping[str, Any], true: float) -> bool | None:
+def _score_estimate(name: str, estimate: Mapping[str, Any], true: float, scale: float) -> Json:
+    """Return the error of an estimate relative to a scale, and whether its interval holds."""
     low, high = estimate.get("low"), estimate.get("high")
-    return None if low is None or high is None else bool(low <= true <= high)
+    return {
+        "name": name,
+        "error": abs(estimate["value"] - true) / abs(scale) if scale else math.inf,
+        "covered": None if low is None or high is None else bool(low <= true <= high),
+    }
 
 
 def select_worst_misses(rows: Sequence[Json], count: int = 30) -> list[Json]:
@@ -204,3 +207,144 @@ def select_worst_misses(rows: Sequence[Json], count: int = 30) -> list[Json]:
     return sorted(
         missed, key=lambda row: (-(row["confidence"] or 0.0), -row["size"], row["noise"])
     )[:count]
+
+
+def score_laboratory(row: Json, verdict: Json, about: Json) -> Json:
+    """Return what the row of a case in a laboratory has in addition; `row` by `score_verdict`."""
+    laboratory, gap = about["laboratory"], verdict.get("gap") or {}
+    is_named = row["said"] == "named"
+    effects = {format_effect_name(effect): effect for effect in verdict.get("effects", [])}
+    findings = [
+        {"name": name, "class": classify_finding(name, effects.get(name, {}), about)}
+        for name in (row["named"] if row["said"] in ("named", "ambiguous") else [])
+    ]
+    classes = [finding["class"] for finding in findings]
+    named_classes = classes if is_named else []
+    affected = {
+        name for name in row["named"] if is_named and _channel(name) in laboratory["channels"]
+    }
+    faults = [
+        check for check in verdict.get("sensors", {}).get("checks", ()) if not check["healthy"]
+    ]
+    is_sound = row["said"] == "none" or (is_named and all(c == "instrument" for c in classes))
+    is_on_channel = "instrument" in named_classes or _is_on_channel(faults, laboratory)
+    scores: Json = {
+        "healthy": is_sound and not (faults and laboratory["level"] == "typical"),
+        "instrument": "instrument" in named_classes,
+        "on_channel": bool(affected) or is_on_channel,
+        "sensor_faults": [f"{check['kind']}.{','.join(check['channels'])}" for check in faults],
+        "physics": "physics" in named_classes,
+        "wrong_name": bool({"physics", "false"} & {*named_classes}),
+        "hit": is_named and {*row["truth"]} <= {*row["named"]},
+    }
+    return {
+        "laboratory": laboratory["level"],
+        "imperfection": laboratory["imperfection"],
+        "imperfection_size": laboratory["size"],
+        "findings": findings,
+        **scores,
+        "right": _is_right(row, laboratory["level"], scores),
+        "base": score_base(verdict.get("base", {}), about["base"]),
+        "before": gap.get("held_out_before"), "after": gap.get("held_out_after"),
+        "why": verdict.get("why", verdict.get("reason", "")),
+    }  # fmt: skip
+
+
+def _is_on_channel(faults: Sequence[Json], laboratory: Json) -> bool:
+    """Return whether the instruments called to be mended are those that err."""
+    wrong_gaps = "gap_offset" in laboratory["errors"]
+    return any(
+        {*check["channels"]} & {*laboratory["channels"]} or (check["kind"] == "gap" and wrong_gaps)
+        for check in faults
+    )
+
+
+def _is_right(row: Json, level: str, scores: Json) -> bool:
+    """Return whether the case is a hit: for the table of misses."""
+    match row["kind"]:
+        case "none" if level == "bad":
+            return bool(scores["on_channel"] and not scores["physics"])
+        case "none":
+            return bool(scores["healthy"])
+        case "unknown":
+            return bool(row["unexplained"])
+        case _:
+            return bool(scores["hit"] and not scores["wrong_name"])
+
+
+def classify_finding(name: str, effect: Mapping[str, Any], about: Json) -> str:
+    """Return the class of a named effect, see the module."""
+    if name in [hidden["name"] for hidden in about["effects"]]:
+        return "effect"
+    true = about["laboratory"]["errors"].get(name)
+    if true is None:
+        return "false" if _is_instrument_error(name) else "physics"
+    estimates = effect.get("parameters", {})
+    agrees = any(
+        _agrees(estimates[key], value, VANISHING.get(key, 0.0))
+        for key, values in true.items()
+        if isinstance(estimates.get(key), Mapping)
+        for value in values
+    )
+    return "instrument" if agrees else "false"
+
+
+def _agrees(estimate: Mapping[str, Any], true: float, vanishing: float) -> bool:
+    """Return whether a named error is the true one: in the interval, or of about its size."""
+    low, high = estimate.get("low"), estimate.get("high")
+    error, true_error = estimate["value"] - vanishing, true - vanishing
+    is_like = true_error * error > 0 and 1 / SIZE_RATIO <= error / true_error <= SIZE_RATIO
+    is_inside = low is not None and high is not None and low <= true <= high
+    return bool(is_like or is_inside)
+
+
+def _is_instrument_error(name: str) -> bool:
+    return name.startswith("sensor_") or name in ("gap_offset", "mass_error", "table_tilt")
+
+
+def _channel(name: str) -> str:
+    return name.partition(".")[2]
+
+
+def score_base(estimates: Mapping[str, Any], true_base: Mapping[str, float]) -> list[Json]:
+    """Return relative error and interval coverage of each base parameter of a verdict.
+
+    The gap is that of a side, averaged over both: a verdict states its correction.
+    """
+    rows = []
+    for name, key in BASE_KEYS.items():
+        if name in estimates:
+            rows.append(_score_estimate(name, estimates[name], true_base[key], true_base[key]))
+    for name, estimate in estimates.items():
+        if name.startswith(GAP_PREFIX):
+            true_gap = 0.5 * sum(true_base[key] for key in GAP_KEYS.values())
+            stated = true_base["stated_gap_m"]
+            rows.append(_score_estimate("gap", estimate, true_gap - stated, true_gap))
+    return rows
+
+
+def score_identification(identified: Json, about: Json) -> Json:
+    """Return the row of an identification: error and coverage of each parameter."""
+    laboratory, true = about["laboratory"], about["base"]
+    gaps = {side: true[key] for side, key in GAP_KEYS.items()}
+    estimates = identified.get("parameters", {})  # none where it failed
+    rows = [
+        _score_estimate(name, estimates[name], true[key], true[key])
+        for name, key in BASE_KEYS.items()
+        if name in estimates
+    ]
+    for name, value in (("gap", sum(gaps.values())), *((f"gap_{k}", v) for k, v in gaps.items())):
+        if name in estimates:
+            rows.append(_score_estimate(name, estimates[name], value, value))
+    return select_case_facts(about) | {
+        "laboratory": laboratory["level"],
+        "imperfection": laboratory["imperfection"],
+        "truth": [],
+        "named": [],
+        "said": identified["verdict"],
+        "confidence": None,
+        "estimates": rows,
+        "right": bool(rows) and all(row["error"] <= MAX_PARAMETER_ERROR for row in rows),
+        "rms_over_noise": identified.get("rms_over_noise"),
+        "warnings": len(identified.get("warnings", ())),
+    }

@@ -17,7 +17,7 @@ from tests.studies.blind.law_study import (
     measure_curve_error,
     measure_force_error,
 )
-from tests.studies.blind.rig_setup import PROFILE, make_rig_toml, simulate_signals
+from tests.studies.blind.rig import PROFILE, make_rig_toml, simulate_signals
 
 NOISE = np.array([1.0, 1.0, 1.0])
 

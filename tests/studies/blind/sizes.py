@@ -23,8 +23,8 @@ from scipy.fft import irfft, rfft, rfftfreq
 
 from table_io.block import Bool2D, Float1D, Float2D
 from table_io.config.base import parse_toml
-from tests.studies.blind.rig_setup import MODEL_TOML, PROFILE, SIGNAL_CHANNELS, StudySignals
-from tests.studies.blind.strata import PlantedEffect
+from tests.studies.blind.cases import PlantedEffect
+from tests.studies.blind.rig import MODEL_TOML, PROFILE, SIGNAL_CHANNELS, StudySignals
 from twin.model.config import ModelConfig
 
 BANDWIDTH_HZ = 225.0  # of the fit; discovery uses 500 Hz samples after a low pass

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
-from tests.studies.blind import baselines
-from tests.studies.blind.baseline_terms import make_regression_problem
-from tests.studies.blind.comparison_tables import format_baseline_table
+from tests.studies.blind import rivals
+from tests.studies.blind.page import format_rival_table
+from tests.studies.blind.rivals import make_regression_problem
 from tests.studies.blind.scoring import score_verdict
-from tests.studies.blind.test_study_scores import about, verdict
+from tests.studies.blind.test_scoring import about, verdict
 
 
 def test_without_the_packages_the_study_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(baselines, "find_spec", lambda package: None)
-    assert baselines.find_baselines() == {}
-    assert "not installed: pysindy, pyoperon, sklearn; pip install" in baselines.describe_missing()
-    monkeypatch.setattr(baselines, "find_spec", lambda package: True)
-    assert set(baselines.find_baselines()) == {"pysindy", "pyoperon", "blackbox"}
-    assert baselines.describe_missing() == ""
+    monkeypatch.setattr(rivals, "find_spec", lambda package: None)
+    assert rivals.find_rivals() == {}
+    assert "not installed: pysindy, pyoperon, sklearn; pip install" in rivals.describe_missing()
+    monkeypatch.setattr(rivals, "find_spec", lambda package: True)
+    assert set(rivals.find_rivals()) == {"pysindy", "pyoperon", "blackbox"}
+    assert rivals.describe_missing() == ""
 
 
 def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
@@ -43,16 +43,16 @@ def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
     ],
 )
 def test_sparse_regression_names_what_the_state_makes(effect: str, values: Any) -> None:
-    sindy = pytest.importorskip("tests.studies.blind.baseline_sindy", exc_type=ImportError)
-    fitted = sindy.select_terms(make_regression_problem(log(format_truth(effect, **values)), SNM))
+    pytest.importorskip("pysindy", exc_type=ImportError)
+    fitted = rivals.select_terms(make_regression_problem(log(format_truth(effect, **values)), SNM))
     assert fitted["effects"][0]["id"] == effect
     assert fitted["gap"]["held_out_after"] < 0.7 * fitted["gap"]["held_out_before"]
 
 
 def test_boosted_trees_close_a_gap_that_has_no_name() -> None:
-    blackbox = pytest.importorskip("tests.studies.blind.baseline_blackbox", exc_type=ImportError)
+    pytest.importorskip("sklearn", exc_type=ImportError)
     truth = format_truth("cubic_stiffness", k3=1e9)
-    fitted = blackbox.fit_boosted_trees(make_regression_problem(log(truth), SNM))
+    fitted = rivals.fit_boosted_trees(make_regression_problem(log(truth), SNM))
     assert fitted["effects"] == []
     assert fitted["gap"]["held_out_after"] < 0.7 * fitted["gap"]["held_out_before"]
 
@@ -67,7 +67,7 @@ def test_the_table_lays_them_side_by_side() -> None:
         }},
         score_verdict(verdict("none"), about("none")) | {"held_out": 1.0},
     ]  # fmt: skip
-    lines = list(format_baseline_table(rows))
+    lines = list(format_rival_table(rows))
     assert "| table_tilt | 1/1 | 0/1 | 1.010 | 1.500 | 2.250 |" in lines
     assert not any("(nothing)" in line for line in lines), "no rival saw that case"
-    assert list(format_baseline_table(rows[1:])) == []
+    assert list(format_rival_table(rows[1:])) == []

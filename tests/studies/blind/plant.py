@@ -1,4 +1,4 @@
-"""Generation of a case: public files in cases/<label>, ground truth in sealed/<label>.
+"""The plant of a case: its sealed truth, the tests that it plays, and the files of the study.
 
     cases/<label>   log.mcap  profile.toml  model.toml
     sealed/<label>  truth.toml  about.json
@@ -7,11 +7,11 @@ The recording comes from an ordinary session on the simulated table at maximum s
 the nominal values and the SHA-256 of the sealed file, which is salted.
 """
 
-import hashlib
 import json
 import math
 import shutil
 import tempfile
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -23,25 +23,20 @@ from table_io.backends import Backend, open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.calibration import compute_tare, volts_to_si
+from table_io.config.profile import Profile
 from table_io.config.toml_text import format_toml
 from table_io.records import Record, RunStop
 from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
-from tests.studies.blind.amplitude_search import (
-    BaselineResidual,
-    apply_sensor_effect,
-    evaluate_residual,
-    find_share,
-    scale_parameters,
-)
+from tests.builders.rigs import read_rig_text
+from tests.studies.blind.cases import Case, PlantedEffect
 from tests.studies.blind.laboratory_truth import (
     compute_setup_errors,
     list_affected_channels,
     list_true_errors,
     measure_visible_size,
 )
-from tests.studies.blind.rig_setup import (
+from tests.studies.blind.rig import (
     MODEL_TOML,
-    NOMINAL_RIG,
     PROFILE,
     PROFILE_TOML,
     SIGNAL_CHANNELS,
@@ -51,44 +46,102 @@ from tests.studies.blind.rig_setup import (
     simulate_readings,
     simulate_signals,
 )
-from tests.studies.blind.strata import Case, PlantedEffect
+from tests.studies.blind.sizes import (
+    BaselineResidual,
+    apply_sensor_effect,
+    evaluate_residual,
+    find_share,
+    scale_parameters,
+)
 from twin.recording.mcap_log import write_items
 from twin.setup.run_config import RunConfig, from_texts
 
 TRUTH_DIGITS = 6  # significant digits of a number in the truth
+# Base parameter of a case -> key of a truth, and of the nominal rig.
+BASE_KEYS = {
+    "damper_stiffness": "damper_stiffness_n_m",
+    "damper_damping": "damper_damping_n_s_m",
+    "bumper_stiffness": "bumper_stiffness_n_m",
+    "bumper_damping": "bumper_damping_n_s_m",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class CasePaths:
-    """Folders and files of a case."""
+    """Folders and files of a case: discovery may read `case_dir`, the truth is in `sealed_dir`."""
 
     root: Path
     label: str
 
     @property
     def case_dir(self) -> Path:
-        """Folder that discovery may read."""
         return self.root / "cases" / self.label
 
     @property
     def sealed_dir(self) -> Path:
-        """Folder with the ground truth."""
         return self.root / "sealed" / self.label
 
     @property
     def log(self) -> Path:
-        """Path of the recording."""
         return self.case_dir / "log.mcap"
 
     @property
     def verdict(self) -> Path:
-        """Path of the verdict of discovery."""
         return self.case_dir / "verdict.json"
+
+    @property
+    def truth(self) -> Path:
+        return self.sealed_dir / "truth.toml"
 
     @property
     def about(self) -> Path:
         """Path of the description of the case, for scoring."""
         return self.sealed_dir / "about.json"
+
+    def clear(self) -> None:
+        """Make both folders, empty: what an interrupted study left of the case is removed."""
+        for folder in (self.case_dir, self.sealed_dir):
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+
+
+class SealedPlant:
+    """The plant of a case on a rig: it plays any test, each with noise of its own.
+
+    On another rig than `simulated` the truth also states the instruments of that rig.
+    """
+
+    def __init__(self, case: Case, truth: Path, rig: str = "simulated") -> None:
+        self.case, self._truth, self._rig, self._tests = case, truth, rig, 0
+        if rig != "simulated":
+            hidden = tomllib.loads(read_rig_text(rig))["simulated"]["hidden"]
+            self._truth = truth.with_name(f"truth_{rig}.toml")
+            text = truth.read_text(encoding="utf-8") + "\n" + format_toml(hidden)
+            self._truth.write_text(text, encoding="utf-8")
+
+    @classmethod
+    def seal(cls, case: Case, truth: Mapping[str, Any], path: Path) -> "SealedPlant":
+        """Write a truth, salted, and return the plant that has it."""
+        path.write_text(f"# {case.salt}\n" + format_toml(truth), encoding="utf-8")
+        return cls(case, path)
+
+    def make_rig(self, noise: float, seed: int = 0) -> str:
+        """Return the config of its rig, which names the truth by its hash."""
+        return make_rig_toml(noise, seed, self._truth, self._rig)
+
+    def record(
+        self, log: Path, is_protected: bool = True, profile_toml: str = PROFILE_TOML
+    ) -> RunStop:
+        """Record a test, by default the study's; return its end."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        log.unlink(missing_ok=True)
+        rig = self.make_rig(self.case.cell.noise, self.case.noise_seed + self._tests)
+        self._tests += 1
+        return record_test(rig, self.case.label, log, is_protected, profile_toml)
+
+    def simulate(self, profile: Profile = PROFILE) -> StudySignals:
+        """Return the true signals of a test."""
+        return simulate_signals(self.make_rig(0.0), profile)
 
 
 def generate_case(case: Case, root: Path) -> CasePaths:
@@ -99,23 +152,15 @@ def generate_case(case: Case, root: Path) -> CasePaths:
     paths = CasePaths(root, case.label)
     if paths.about.is_file():
         return paths
-    for folder in (paths.case_dir, paths.sealed_dir):
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+    paths.clear()
     shares, residual = find_shares(case)
-    truth_path = paths.sealed_dir / "truth.toml"
     truth = make_truth(case, case.planted, shares)
     if case.imperfections:
         truth["imperfections"] = [*map(_describe_imperfection, case.imperfections)]
-    text = f"# {case.salt}\n" + format_toml(truth)
-    truth_path.write_text(text, encoding="utf-8")
+    plant = SealedPlant.seal(case, truth, paths.truth)
     outcome = f"not played: the effect reaches size {residual.size:.3g}"
     if case.cell.accepts(residual.size):
-        rig = make_rig_toml(
-            case.cell.noise, case.noise_seed, str(truth_path.resolve()), hash_truth(text)
-        )
-        stop = record_test(rig, case.label, paths.log, not case.imperfections)
-        outcome = stop.verdict if stop.verdict == "complete" else f"{stop.verdict}: {stop.reason}"
+        outcome = describe_end(plant.record(paths.log, not case.imperfections))
     (paths.case_dir / "profile.toml").write_text(PROFILE_TOML, encoding="utf-8")
     (paths.case_dir / "model.toml").write_text(MODEL_TOML, encoding="utf-8")
     about = {
@@ -135,9 +180,14 @@ def generate_case(case: Case, root: Path) -> CasePaths:
         ],
     }
     if case.imperfections:
-        about["laboratory"] = _describe_laboratory(case, truth_path, hash_truth(text))
+        about["laboratory"] = _describe_laboratory(plant)
     paths.about.write_text(json.dumps(about, indent=1), encoding="utf-8")
     return paths
+
+
+def describe_end(stop: RunStop) -> str:
+    """Return how a test ended, with the reason unless it is complete."""
+    return stop.verdict if stop.verdict == "complete" else f"{stop.verdict}: {stop.reason}"
 
 
 def _describe_base(
@@ -165,15 +215,14 @@ def _describe_imperfection(imperfection: Imperfection) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _describe_laboratory(case: Case, truth_path: Path, sha256: str) -> dict[str, Any]:
+def _describe_laboratory(plant: SealedPlant) -> dict[str, Any]:
     """Return the laboratory of a case for scoring, with the errors that a verdict may name."""
-    rig = make_rig_toml(0.0, case.noise_seed, str(truth_path), sha256)
-    signals, readings = simulate_readings(rig)
-    noise = compute_noise_rms(case.cell.noise)
+    case = plant.case
+    signals, readings = simulate_readings(plant.make_rig(0.0, case.noise_seed))
     return {
         "level": case.cell.laboratory,
         "imperfection": case.cell.imperfection,
-        "size": measure_visible_size(signals, readings, noise),
+        "size": measure_visible_size(signals, readings, compute_noise_rms(case.cell.noise)),
         "imperfections": [*map(_describe_imperfection, case.imperfections)],
         "channels": list_affected_channels(case.imperfections, SIGNAL_CHANNELS),
         "errors": list_true_errors(case.imperfections, signals, readings),
@@ -205,13 +254,10 @@ def make_truth(
     case: Case, planted_effects: Sequence[PlantedEffect], shares: Sequence[float]
 ) -> dict[str, Any]:
     """Return the content of the sealed file: scattered base parameters and planted effects."""
-    table, scatter = NOMINAL_RIG["simulated"], case.base
-    names = ("damper_stiffness", "damper_damping", "bumper_stiffness", "bumper_damping")
-    units = ("n_m", "n_s_m", "n_m", "n_s_m")
-    keys = [f"{name}_{unit}" for name, unit in zip(names, units, strict=True)]
-    base = {key: scatter[name] * table[key] for key, name in zip(keys, names, strict=True)}
-    right, left = PROFILE.specimen.gaps_m
-    base |= {"gap_right_m": scatter["gap"] * right, "gap_left_m": scatter["gap"] * left}
+    nominal = tomllib.loads(read_rig_text("simulated"))["simulated"]
+    base = {key: case.base[name] * nominal[key] for name, key in BASE_KEYS.items()}
+    for side, gap in zip(("right", "left"), PROFILE.specimen.gaps_m, strict=True):
+        base[f"gap_{side}_m"] = case.base["gap"] * gap
     effects = [
         {"id": planted.effect.definition.id, "form": planted.effect.definition.form}
         | ({"channel": planted.effect.channel} if planted.effect.channel else {})
@@ -254,11 +300,10 @@ def find_shares(case: Case) -> tuple[list[float], BaselineResidual]:
 def simulate_truth(
     case: Case, planted: Sequence[PlantedEffect], shares: Sequence[float]
 ) -> StudySignals:
-    text = format_toml(make_truth(case, planted, shares))
+    """Return the true signals of the study's test with effects of these shares."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "truth.toml"
-        path.write_text(text, encoding="utf-8")
-        return simulate_signals(make_rig_toml(0.0, truth=str(path), sha256=hash_truth(text)))
+        truth = make_truth(case, planted, shares)
+        return SealedPlant.seal(case, truth, Path(folder) / "truth.toml").simulate()
 
 
 def record_test(
@@ -309,8 +354,3 @@ def _round_values(values: dict[str, float]) -> dict[str, float]:
         for name, value in values.items()
         if math.isfinite(value)
     }
-
-
-def hash_truth(text: str) -> str:
-    """Return the SHA-256 by which a recording seals its truth."""
-    return hashlib.sha256(text.encode()).hexdigest()

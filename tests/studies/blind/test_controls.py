@@ -1,21 +1,13 @@
 """Controls that must fail: time reversed, the truth not in the library, truths of other cases."""
 
-import json
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
-from tests.studies.blind import study_work
-from tests.studies.blind.command import run_cases
-from tests.studies.blind.comparison_tables import compute_shuffled_rates
-from tests.studies.blind.controls import discover_without, reverse_log, summarize_verdict
-from tests.studies.blind.report import CONTROLS_FILE, RESULTS_FILE, TABLE_FILE, write_study_pages
+from tests.studies.blind.discovery_study import discover_without, reverse_log, summarize_verdict
+from tests.studies.blind.page import compute_shuffled_rates
 from tests.studies.blind.scoring import score_verdict
-from tests.studies.blind.test_study_scores import about, verdict
-from twin.system.process_pool import Workers
+from tests.studies.blind.test_scoring import about, verdict
 
 QUADRATIC = format_truth("quadratic_damping", c2=6e3)
 # Left out of every run of the test, for its length; the study itself leaves out nothing.
@@ -76,21 +68,3 @@ def test_shuffled_truths_fall_to_chance() -> None:
     assert others == pytest.approx(6 / 30), "each case has one other of five with its truth"
     unnamed = [row | {"said": "none"} for row in rows]
     assert compute_shuffled_rates(unnamed)[:2] == (0.0, 0.0)
-
-
-def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    good: dict[str, Any] = {"said": "unexplained", "named": [], "confidence": None, "fooled": False}
-    bad = {"said": "named", "named": ["table_tilt"], "confidence": 0.9, "fooled": True}
-    rows: list[dict[str, Any]] = [
-        {"number": 7000, "reversed": good, "without": bad, "right": False},
-        {"number": 16000, "reversed": good, "without": good, "right": True},
-        {"number": 25000, "failed": "why"},
-    ]
-    (tmp_path / CONTROLS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows))
-    lines = write_study_pages(tmp_path).read_text().splitlines()
-    assert any("time reversed" in line and "(0/2;" in line for line in lines)
-    assert any("not in the library: confident" in line and "(1/2;" in line for line in lines)
-    assert run_cases(tmp_path, [7000, 16000], Workers(1), study_work.fine, CONTROLS_FILE) == 0
-    assert (tmp_path / CONTROLS_FILE).read_text().count("\n") == 3
-    assert not (tmp_path / RESULTS_FILE).exists()
-    assert (tmp_path / TABLE_FILE).is_file()

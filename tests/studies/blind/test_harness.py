@@ -1,7 +1,8 @@
-"""A study as it runs: processes that die, what is done already, verdicts that fail, bad input."""
+"""A study as it runs: what is done already, verdicts that fail, bad input."""
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -10,23 +11,34 @@ import pytest
 
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
-from tests.studies.blind import evaluation, study_work
-from tests.studies.blind.command import run_cases, run_discovery_study
-from tests.studies.blind.generation import CasePaths
-from tests.studies.blind.report import RESULTS_FILE, TABLE_FILE, read_rows
-from tests.studies.blind.strata import draw_case
-from tests.studies.blind.test_study_scores import OTHER, TRUE, about, verdict
+from tests.studies.blind import discovery_study
+from tests.studies.blind.cases import draw_case
+from tests.studies.blind.discovery_study import format_row, run_discovery_study
+from tests.studies.blind.harness import RESULTS_FILE, Study, StudyOptions, read_rows, run_study
+from tests.studies.blind.page import CONTROLS_FILE, TABLE_FILE, write_study_pages
+from tests.studies.blind.plant import CasePaths
+from tests.studies.blind.scoring import score_verdict
+from tests.studies.blind.test_scoring import OTHER, TRUE, about, verdict
 from twin.system.process_pool import Workers
 
 Json = dict[str, Any]
 
 
+def judge_clean(number: int) -> Json:
+    """The row of a clean case, by the process that judged it."""
+    case = about("none", number=number, cell="none/1%", size=0.0)
+    return score_verdict({"verdict": "none"}, case) | {"process": os.getpid()}
+
+
+STUDY = Study(judge_clean, format_row, write_study_pages)
+
+
 def test_a_study_goes_on_after_a_line_that_was_cut(tmp_path: Path) -> None:
     """Done ones are not done again, failed and cut ones are; nothing that was found is lost."""
-    rows = [study_work.fine(0), study_work.fine(2) | {"failed": "why"}]
+    rows = [judge_clean(0), judge_clean(2) | {"failed": "why"}]
     text = "".join(json.dumps(row) + "\n" for row in rows) + '{"number": 4, "ri'
     (tmp_path / RESULTS_FILE).write_text(text)
-    assert run_cases(tmp_path, [0, 2, 4], Workers(1), study_work.fine) == 0
+    assert run_study(STUDY, tmp_path, [0, 2, 4], Workers(1)) == 0
     after = read_rows(tmp_path / RESULTS_FILE)
     assert [row["number"] for row in after] == [0, 2, 2, 4]
     assert after[0]["process"] == rows[0]["process"]
@@ -46,7 +58,7 @@ def test_a_verdict_that_fails_is_a_miss_that_says_why(
     def broken(shown: Path) -> Json:
         raise ValueError("no way")
 
-    row = evaluation.evaluate_case(tmp_path, 3000, broken)
+    row = discovery_study.evaluate_case(tmp_path, 3000, broken)
     assert row["failed"] == "ValueError: no way"
     assert (row["top1"], row["right"], row["sized"]) == (False, False, True)
 
@@ -54,9 +66,9 @@ def test_a_verdict_that_fails_is_a_miss_that_says_why(
         assert shown == places.case_dir, "a method sees only what is shown"
         return verdict("named", "bumper_hardening", seconds=math.nan)
 
-    monkeypatch.setattr(evaluation, "BASELINES", {"rival": broken})
-    monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, effects: 1.05)
-    row = evaluation.evaluate_case(tmp_path, 3000, answer)
+    monkeypatch.setattr(discovery_study, "RIVALS", {"rival": broken})
+    monkeypatch.setattr(discovery_study, "fit_true_structure", lambda shown, effects: 1.05)
+    row = discovery_study.evaluate_case(tmp_path, 3000, answer)
     assert row["right"]
     assert row["after_oracle"] == 1.0
     assert row["rivals"]["rival"]["top1"] is False
@@ -75,22 +87,24 @@ def test_of_two_effects_the_row_says_what_mark_the_lesser_leaves(
         folder.mkdir(parents=True)
     places.about.write_text(json.dumps(about("pair", TRUE, OTHER, number=number)))
     errors = {(TRUE["name"], OTHER["name"]): 1.0, (TRUE["name"],): 1.2, (OTHER["name"],): 3.0}
-    monkeypatch.setattr(evaluation, "fit_true_structure", lambda shown, names: errors[tuple(names)])
-    monkeypatch.setattr(evaluation, "BASELINES", {})
+    monkeypatch.setattr(
+        discovery_study, "fit_true_structure", lambda shown, names: errors[tuple(names)]
+    )
+    monkeypatch.setattr(discovery_study, "RIVALS", {})
 
     def answer(shown: Path) -> Json:
         if fails:
             raise ValueError("no way")
         return verdict("named", TRUE["name"])
 
-    row = evaluation.evaluate_case(tmp_path, number, answer)
+    row = discovery_study.evaluate_case(tmp_path, number, answer)
     assert row["mark"] == 1.2
     assert (row["both"], row["one"]) == (False, not fails)
     del errors[(OTHER["name"],)]  # no model of the library has it alone
-    assert evaluation.evaluate_case(tmp_path, number, answer)["mark"] is None
+    assert discovery_study.evaluate_case(tmp_path, number, answer)["mark"] is None
 
 
-def test_bad_input_is_told(tmp_path: Path) -> None:
+def test_what_cannot_be_studied_is_refused(tmp_path: Path) -> None:
     for asked, key, value in (
         ({"seeds": 0}, "--seeds", 0),
         ({"patterns": ["nix/*"]}, "--cells", "nix/*"),
@@ -100,9 +114,29 @@ def test_bad_input_is_told(tmp_path: Path) -> None:
     ):
         given: Json = {"seeds": 1, "patterns": ["none/1%"], "workers": 1, "resume": False}
         with pytest.raises(InputError) as error:
-            run_discovery_study(tmp_path / "new", **(given | asked))
+            run_discovery_study(StudyOptions(tmp_path / "new", **(given | asked)))
         assert (error.value.key, error.value.value) == (key, value)
+        assert not (tmp_path / "new").exists()
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / TABLE_FILE).touch()
     with raises_input_error(key="--out", value=str(tmp_path / "there")):
-        run_discovery_study(tmp_path / "there", 1, ["none/1%"], 1, False)
+        run_discovery_study(StudyOptions(tmp_path / "there", 1, ["none/1%"], 1, False))
+
+
+def test_the_page_has_the_controls_and_goes_on_where_it_stopped(tmp_path: Path) -> None:
+    good: Json = {"said": "unexplained", "named": [], "confidence": None, "fooled": False}
+    bad = {"said": "named", "named": ["table_tilt"], "confidence": 0.9, "fooled": True}
+    rows: list[Json] = [
+        {"number": 7000, "reversed": good, "without": bad, "right": False},
+        {"number": 16000, "reversed": good, "without": good, "right": True},
+        {"number": 25000, "failed": "why"},
+    ]
+    (tmp_path / CONTROLS_FILE).write_text("".join(json.dumps(row) + "\n" for row in rows))
+    lines = write_study_pages(tmp_path).read_text().splitlines()
+    assert any("time reversed" in line and "(0/2;" in line for line in lines)
+    assert any("not in the library: confident" in line and "(1/2;" in line for line in lines)
+    controls = Study(judge_clean, format_row, write_study_pages, CONTROLS_FILE)
+    assert run_study(controls, tmp_path, [7000, 16000], Workers(1)) == 0
+    assert (tmp_path / CONTROLS_FILE).read_text().count("\n") == 3
+    assert not (tmp_path / RESULTS_FILE).exists()
+    assert (tmp_path / TABLE_FILE).is_file()

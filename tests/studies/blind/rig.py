@@ -5,10 +5,12 @@ below 1.6 Hz, the impacting branch up to 4.4 Hz forward, flight from 4.2 Hz back
 level control are off: the twin is driven by the measured table motion anyway.
 """
 
+import hashlib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,6 +24,7 @@ from table_io.config.rig import RigConfig
 from table_io.config.toml_text import format_toml
 from table_io.excitation.trajectory import plan_sweep
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.rigs import read_rig_text
 
 PROFILE_TOML = """\
 title = "G4, ten frequencies up and back"
@@ -57,9 +60,6 @@ abort_db = 12.0
 """
 PROFILE = parse_toml(PROFILE_TOML, Profile, "the study's test")
 MODEL_TOML = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
-NOMINAL_RIG: dict[str, Any] = tomllib.loads(
-    (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
-)
 SETTLING_S = 8.0  # until the mass is at rest, to avoid spectral leakage
 SIGNAL_CHANNELS = (
     "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2", *RIGHT_CELLS, *LEFT_CELLS,
@@ -85,19 +85,25 @@ class StudySignals:
         return np.asarray(self.label != Label.REST)
 
 
-def make_rig_toml(noise: float, seed: int = 0, truth: str = "", sha256: str = "") -> str:
-    """Return the rig config; the noise of each sensor is a share of its rms in the nominal test.
+def make_rig_toml(
+    noise: float, seed: int = 0, truth: Path | None = None, name: str = "simulated"
+) -> str:
+    """Return a rig config whose plant hides a truth, sealed by the hash of its file.
 
-    The nominal rms is used so that the noise does not depend on the truth.
+    On the rig `simulated` the noise of each sensor is a share of its rms in the nominal test, so
+    that it does not depend on the truth. Another rig keeps its own.
     """
-    config = NOMINAL_RIG | {"simulated": NOMINAL_RIG["simulated"] | {"seed": seed}}
-    if truth:
-        config["simulated"] |= {"truth": truth, "truth_sha256": sha256}
-    rms = compute_noise_rms(noise) if noise else {}
-    config["sensors"] = [
-        sensor | {"noise_rms": rms.get(sensor["channel"], 0.0) / _si_per_unit(sensor["channel"])}
-        for sensor in NOMINAL_RIG["sensors"]
-    ]
+    config: dict[str, Any] = tomllib.loads(read_rig_text(name))
+    config["simulated"]["seed"] = seed
+    if truth is not None:
+        config["simulated"].pop("hidden", None)  # a rig takes either this or a truth
+        digest = hashlib.sha256(truth.read_bytes()).hexdigest()
+        config["simulated"] |= {"truth": str(truth.resolve()), "truth_sha256": digest}
+    if name == "simulated":
+        rms = compute_noise_rms(noise) if noise else {}
+        sensors = parse_toml(format_toml(config), RigConfig, name).sensors
+        for table, sensor in zip(config["sensors"], sensors, strict=True):
+            table["noise_rms"] = rms.get(sensor.channel, 0.0) / sensor.si_per_unit
     return format_toml(config)
 
 
@@ -109,25 +115,6 @@ def compute_noise_rms(noise: float) -> dict[str, float]:
         name: float(f"{noise * values[signals.moving].std():.1e}")
         for name, values in signals.channels.items()
     }
-
-
-def make_hydraulic_rig_toml(seed: int, truth: str, sha256: str) -> str:
-    """Return the config of the simulated hydraulic rig; its instruments are in the truth."""
-    config = _read_hydraulic_rig()
-    del config["simulated"]["hidden"]  # a rig takes either this or a truth
-    config["simulated"] |= {"seed": seed, "truth": truth, "truth_sha256": sha256}
-    return format_toml(config)
-
-
-def add_hydraulic_instruments(truth: str) -> str:
-    """Return the text of a truth with the instruments of the simulated hydraulic rig."""
-    hidden: dict[str, Any] = _read_hydraulic_rig()["simulated"]["hidden"]
-    return f"{truth}\n{format_toml(hidden)}"
-
-
-def _read_hydraulic_rig() -> dict[str, Any]:
-    path = PROFILES_DIR / "rigs" / "hydraulic.toml"
-    return tomllib.loads(path.read_text(encoding="utf-8"))
 
 
 def simulate_signals(rig_text: str, profile: Profile = PROFILE) -> StudySignals:
@@ -166,8 +153,3 @@ def simulate_readings(
         for name in channels
     }
     return StudySignals(channels, force_right, force_left, step, np.asarray(label)), readings
-
-
-def _si_per_unit(channel: str) -> float:
-    rig = parse_toml(format_toml(NOMINAL_RIG), RigConfig, "simulated.toml")
-    return next(sensor.si_per_unit for sensor in rig.sensors if sensor.channel == channel)

@@ -7,15 +7,10 @@ from typing import Any
 import pytest
 
 from table_io.config.base import PROFILES_DIR
-from tests.input_errors import raises_input_error
-from tests.studies.blind.decisive_runs import (
-    evaluate_decision,
-    format_rates,
-    run_decide_study,
-)
-from tests.studies.blind.generation import record_test
-from tests.studies.blind.rig_setup import PROFILE_TOML
-from tests.studies.blind.strata import draw_case, list_case_numbers
+from tests.studies.blind.cases import draw_case, list_case_numbers
+from tests.studies.blind.decide_study import evaluate_decision, format_rates
+from tests.studies.blind.plant import record_test
+from tests.studies.blind.rig import PROFILE_TOML
 from twin.discovery.discover import discover_effects
 from twin.discovery.loading import load_logs
 from twin.discovery.parameters import STIFFNESS, EffectKey
@@ -54,11 +49,6 @@ def test_an_open_verdict_counts_as_decided_only_if_the_next_is_right() -> None:
     assert "(1/1;" in find_row(text, "decided by the first recording, of these right")
     assert "| 0.9 to 1 | 0.95 | 50.0 % (1/2;" in text
     assert "| 0 to 0.5 | 0.15 | 50.0 % (1/2;" in text
-
-
-def test_an_unknown_first_test_is_refused() -> None:
-    with raises_input_error(key="--first", allowed="flight"):
-        run_decide_study(None, 1, (), None, False, "swep")
 
 
 def test_a_case_in_which_a_study_was_interrupted_is_begun_anew(tmp_path: Path) -> None:

@@ -13,8 +13,18 @@ from table_io.block import Label
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS, GroundTruth
-from tests.studies.blind import amplitude_search, generation, strata
-from tests.studies.blind.amplitude_search import (
+from tests.studies.blind import cases, plant, sizes
+from tests.studies.blind.cases import CELLS, NUMBERS_PER_CELL, Case, draw_case, list_case_numbers
+from tests.studies.blind.discovery_study import evaluate_case
+from tests.studies.blind.plant import CasePaths, generate_case
+from tests.studies.blind.rig import (
+    PROFILE,
+    StudySignals,
+    compute_noise_rms,
+    make_rig_toml,
+    simulate_signals,
+)
+from tests.studies.blind.sizes import (
     BaselineResidual,
     apply_sensor_effect,
     evaluate_residual,
@@ -22,16 +32,6 @@ from tests.studies.blind.amplitude_search import (
     max_share,
     scale_parameters,
 )
-from tests.studies.blind.evaluation import evaluate_case
-from tests.studies.blind.generation import CasePaths, generate_case
-from tests.studies.blind.rig_setup import (
-    PROFILE,
-    StudySignals,
-    compute_noise_rms,
-    make_rig_toml,
-    simulate_signals,
-)
-from tests.studies.blind.strata import CELLS, NUMBERS_PER_CELL, Case, draw_case, list_case_numbers
 from twin.recording.reader import read_recording as read_log
 from twin.results.recordings import read_recorded_config
 
@@ -95,7 +95,7 @@ def test_a_pair_is_two_effects_of_the_library() -> None:
 def test_sizes_land_where_they_were_asked(cell: str) -> None:
     """The residual of a refitted baseline over the noise, from signals with that noise on."""
     case = case_in(cell)
-    shares, left = generation.find_shares(case)
+    shares, left = plant.find_shares(case)
     assert left.size == pytest.approx(case.cell.size, rel=0.1)
     assert noisy_size(case, shares[0]) == pytest.approx(case.cell.size, rel=0.25)
 
@@ -111,13 +111,13 @@ def test_the_size_of_the_case_that_was_made(generated_case: tuple[Case, CasePath
 
 def test_noise_alone_has_size_one() -> None:
     signals = simulate_signals(make_rig_toml(0.0))
-    for noise in strata.NOISE_LEVELS:
+    for noise in cases.NOISE_LEVELS:
         assert noisy(signals, signals, compute_noise_rms(noise)).rms == pytest.approx(1.0, abs=0.05)
 
 
 def noisy_size(case: Case, share: float) -> float:
     (planted,) = case.planted
-    signals = generation.simulate_truth(case, case.planted, [share])
+    signals = plant.simulate_truth(case, case.planted, [share])
     return noisy(
         apply_sensor_effect(planted, share, signals), signals, compute_noise_rms(case.cell.noise)
     ).rms
@@ -126,7 +126,7 @@ def noisy_size(case: Case, share: float) -> float:
 def noisy(signals: StudySignals, truly: StudySignals, rms: Mapping[str, float]) -> BaselineResidual:
     """What the baseline leaves of noisy readings over their noise; the noise is white to 225 Hz."""
     draw, size = np.random.default_rng(1), signals.step.size
-    inside = np.fft.rfftfreq(size, 1e-3) <= amplitude_search.BANDWIDTH_HZ
+    inside = np.fft.rfftfreq(size, 1e-3) <= sizes.BANDWIDTH_HZ
     noise = {
         name: np.fft.irfft(np.fft.rfft(draw.normal(0.0, s, size)) * inside, size)
         for name, s in rms.items()
@@ -159,7 +159,7 @@ def test_what_does_not_have_its_size_is_not_played(
 ) -> None:
     case = case_in("single/gap_offset/10/1%")
     little = BaselineResidual(2.0, {1.0: 1.0}, {"flight": 1.0})
-    monkeypatch.setattr(generation, "find_shares", lambda case: ([1.0], little))
+    monkeypatch.setattr(plant, "find_shares", lambda case: ([1.0], little))
     places = generate_case(case, tmp_path)
     about = json.loads(places.about.read_text())
     assert about["ended"] == "not played: the effect reaches size 2.24"
@@ -264,7 +264,7 @@ def test_every_kind_that_can_be_hidden_has_what_the_generator_needs() -> None:
     for cell in CELLS:
         for hidden in cell.effects:
             assert hidden.amplitudes, hidden.name
-    for (effect, name), (low, high) in strata.SHAPE_RANGES.items():
+    for (effect, name), (low, high) in cases.SHAPE_RANGES.items():
         kinds = [definitions for definitions in EFFECT_DEFINITIONS if definitions.id == effect]
         parameters = [q for kind in kinds for q in kind.parameters if q.name == name]
         assert parameters, (effect, name)

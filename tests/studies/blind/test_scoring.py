@@ -7,13 +7,14 @@ from typing import Any
 import pytest
 from scipy.optimize import brentq
 
-from tests.studies.blind.rates import Rate, compute_calibration, compute_metrics, select_usable
-from tests.studies.blind.report import (
-    CONFUSION_FILE,
-    RESULTS_FILE,
-    compute_confusion,
-    write_study_pages,
+from tests.studies.blind.harness import RESULTS_FILE
+from tests.studies.blind.metrics import (
+    Rate,
+    compute_calibration,
+    compute_metrics,
+    select_usable,
 )
+from tests.studies.blind.page import format_table, write_study_pages
 from tests.studies.blind.scoring import format_effect_name, score_verdict, select_worst_misses
 
 Json = dict[str, Any]
@@ -275,14 +276,15 @@ def test_calibration_is_in_bins_of_what_was_stated() -> None:
     assert (rate.hits, rate.count) == (10, 12)
 
 
-def test_confusion_counts_each_truth_by_what_was_said() -> None:
-    truths, columns, counts = compute_confusion(select_usable(rows()))
-    assert truths == ["bumper_hardening", "(nothing)"]
-    table = {(t, c): counts[i, j] for i, t in enumerate(truths) for j, c in enumerate(columns)}
-    assert table["bumper_hardening", "bumper_hardening"] == 10
-    assert table["bumper_hardening", "hunt_crossley"] == 2
-    assert table["(nothing)", "ambiguous"] == 1
-    assert counts.sum() == len(select_usable(rows()))
+def test_a_table_counts_each_truth_by_what_was_said() -> None:
+    usable = select_usable(rows())
+    lines = list(format_table("Named", [row for row in usable if row["kind"] == "single"], "top1"))
+    assert "| hidden | 1 %, size 3 | all | verdicts |" in lines
+    (line,) = [line for line in lines if line.startswith("| bumper_hardening |")]
+    assert line.startswith("| bumper_hardening | 10/13 | 76.9 %")
+    assert line.endswith("| bumper_hardening 10, hunt_crossley 2, failed 1 |")
+    false = format_table("Alarms", [row for row in usable if row["kind"] == "none"], "false_alarm")
+    assert any("| (nothing) | 1/4 |" in line and "none 3, ambiguous 1" in line for line in false)
 
 
 def test_the_page_has_counts_misses_and_a_picture(tmp_path: Path) -> None:
@@ -294,4 +296,3 @@ def test_the_page_has_counts_misses_and_a_picture(tmp_path: Path) -> None:
     assert "not played 1 (" in text
     assert [miss["number"] for miss in select_worst_misses(select_usable(rows()))][:2] == [10, 11]
     assert "| 10 | single | bumper_hardening | hunt_crossley | 0.90 |" in text
-    assert (tmp_path / CONFUSION_FILE).read_bytes().startswith(b"\x89PNG")
