@@ -32,14 +32,16 @@ from twin.campaign.gap_comparison import (
 )
 from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
-from twin.campaign.report import LARGER, SMALLER, list_gap_tables, list_gap_values
+from twin.campaign.report import LARGER, SMALLER, SYMBOLS, list_gap_tables
+from twin.campaign.result import GapResult, MergedRun
+from twin.campaign.state import RunPart
 from twin.campaign.summary import read_campaign
 from twin.drawing.page import render_page
 from twin.recording.reader import read_recording
+from twin.results.contracts import MotionResult, PeakAndRms, RunInfo, RunSummary, WindowResult
 from twin.setup.run_config import RunConfig
 from twin.simulation.command import simulate_profile
 
-Json = dict[str, Any]
 WEIGHT_N = 550.0 * 9.80665
 GAPS = (math.inf, 16.0, 4.0, 0.0)
 # Peaks of u in m, a in m/s2 and force in N of two records without bumpers and at 16, 4 and 0 mm.
@@ -50,26 +52,28 @@ PLANTED = {
 }
 
 
-def make_motion(u: float, a: float, force: float) -> Json:
+def make_motion(u: float, a: float, force: float) -> MotionResult:
     peaks = {"u": u, "a": a, "force_r": 0.4 * force, "force_l": force}
-    return {name: {"peak": peak, "rms": peak / 3} for name, peak in peaks.items()} | {
-        "impacts_right": 1, "impacts_left": 2,
-    }  # fmt: skip
+    return MotionResult(
+        **{name: PeakAndRms(peak=peak, rms=peak / 3) for name, peak in peaks.items()},
+        impacts_right=1,
+        impacts_left=2,
+    )
 
 
-def make_summary(u: float, a: float, force: float, twin: float = 1.0) -> Json:
+def make_summary(u: float, a: float, force: float, twin: float = 1.0) -> RunSummary:
     """Of three windows, the second of which has the peaks; the twin's are larger by a factor."""
-    shares = (0.5, 1.0, 0.2)
-    return {
-        "verdict": "complete",
-        "windows": [
-            {
-                "measured": make_motion(k * u, k * a, k * force),
-                "twin": make_motion(*(k * twin * peak for peak in (u, a, force))),
-            }
-            for k in shares
-        ],
-    }
+    windows = [
+        WindowResult(
+            index=index,
+            from_s=0.0,
+            to_s=1.0,
+            measured=make_motion(k * u, k * a, k * force),
+            twin=make_motion(*(k * twin * peak for peak in (u, a, force))),
+        )
+        for index, k in enumerate((0.5, 1.0, 0.2))
+    ]
+    return RunSummary(run=RunInfo(), verdict="complete", steps=[], windows=windows)
 
 
 def make_runs() -> list[RecordRun]:
@@ -93,23 +97,23 @@ def test_the_planted_best_gap_is_recovered_for_each_criterion() -> None:
     acceleration = best["eta_a"]
     assert acceleration is not None
     # eta_a at 16, 4, 0 mm: 2.5, 0.75, 0.9; 2, 0.8, 1.2; 2, 0.9, 0.8
-    assert (acceleration["gap_mm"], acceleration["next_gap_mm"]) == (4.0, 0.0)
-    assert (acceleration["best_in"], acceleration["of"]) == (2, 3)
-    assert acceleration["median"] == pytest.approx(0.8)
-    assert acceleration["next_median"] == pytest.approx(0.9)
-    assert acceleration["margin"] == pytest.approx(0.9 / 0.8 - 1)
-    assert not acceleration["is_smallest_gap"]
+    assert (acceleration.gap_mm, acceleration.next_gap_mm) == (4.0, 0.0)
+    assert (acceleration.best_in, acceleration.of) == (2, 3)
+    assert acceleration.median == pytest.approx(0.8)
+    assert acceleration.next_median == pytest.approx(0.9)
+    assert acceleration.margin == pytest.approx(0.9 / 0.8 - 1)
+    assert not acceleration.is_smallest_gap
     displacement, force = best["eta_d"], best["r"]
     assert displacement is not None
     assert force is not None
     # eta_d at 4 and 0 mm: 0.5, 0.25; 0.3, 0.2; 0.3, 0.2
-    assert (displacement["gap_mm"], displacement["best_in"]) == (0.0, 3)
-    assert (displacement["median"], displacement["next_median"]) == pytest.approx((0.2, 0.3))
-    assert displacement["is_smallest_gap"]
+    assert (displacement.gap_mm, displacement.best_in) == (0.0, 3)
+    assert (displacement.median, displacement.next_median) == pytest.approx((0.2, 0.3))
+    assert displacement.is_smallest_gap
     # force at 4 and 0 mm: 900, 1100; 1300, 800; 700, 1000
-    assert (force["gap_mm"], force["best_in"]) == (4.0, 2)
-    assert force["median"] == pytest.approx(900.0 / WEIGHT_N)
-    assert force["compared_gaps_mm"] == [16.0, 4.0, 0.0]  # there is none without bumpers
+    assert (force.gap_mm, force.best_in) == (4.0, 2)
+    assert force.median == pytest.approx(900.0 / WEIGHT_N)
+    assert force.compared_gaps_mm == [16.0, 4.0, 0.0]  # there is none without bumpers
 
 
 def test_the_compromise_is_the_root_mean_square_of_both() -> None:
@@ -132,7 +136,7 @@ def test_without_bumpers_can_be_the_best() -> None:
     comparison = compare(runs)
     best = rank_gaps(comparison, "measured", "eta_a")
     assert best is not None
-    assert best["gap_mm"] == math.inf
+    assert best.gap_mm == math.inf
     assert rank_gaps(comparison, "measured", "r") is None  # a single gap has a force
     assert "not ranked" in format_best(None)
 
@@ -141,10 +145,10 @@ def test_a_gap_at_which_a_record_is_missing_is_not_ranked() -> None:
     runs = [run for run in make_runs() if (run.record, run.gap_mm) != ("third", 4.0)]
     best = rank_gaps(compare(runs), "measured", "eta_a")
     assert best is not None
-    assert best["compared_gaps_mm"] == [math.inf, 16.0, 0.0]
-    assert best["gap_mm"] == 0.0
-    spread = describe_comparison(compare(runs))["gaps"][2]["measured"]["eta_a"]
-    assert (spread["count"], spread["smallest"]) == (2, pytest.approx(0.75))
+    assert best.compared_gaps_mm == [math.inf, 16.0, 0.0]
+    assert best.gap_mm == 0.0
+    spread = describe_comparison(compare(runs)).gaps[2].measured["eta_a"]
+    assert (spread.count, spread.smallest) == (2, pytest.approx(0.75))
 
 
 def test_repetitions_count_with_their_mean() -> None:
@@ -183,21 +187,29 @@ def test_without_a_free_flight_the_widest_gap_is_the_reference() -> None:
 
 def test_a_run_with_dropouts_is_left_out_and_named(capsys: pytest.CaptureFixture[str]) -> None:
     runs = make_runs()
-    runs[2].summary["gaps"] = 3  # of "long" at 4 mm
+    runs[2].summary.gaps = 3  # of "long" at 4 mm
     # Dropouts of a recording that was repeated do not count.
-    runs[3].summary.update(gaps=2, parts=[{"gaps": 2}, {"gaps": 0}])
+    parts = [
+        RunPart(folder=name, run=name, first_step=0, gaps=gaps)
+        for name, gaps in (("a", 2), ("b", 0))
+    ]
+    repeated = MergedRun.model_construct(**dict(runs[3].summary), parts=parts)
+    repeated.gaps = 2
+    runs[3] = replace(runs[3], summary=repeated)
     comparison = compare(runs)
     assert comparison.left_out == ("long-4.0",)
     best = rank_gaps(comparison, "measured", "eta_a")
     assert best is not None
-    assert best["compared_gaps_mm"] == [math.inf, 16.0, 0.0]
+    assert best.compared_gaps_mm == [math.inf, 16.0, 0.0]
     print_gap_comparison(describe_comparison(comparison))
     assert "dropouts in the recording: long-4.0" in capsys.readouterr().out
     page = render_page(
         Path(gap_comparison.__file__).with_suffix(".html"),
         gaps=describe_comparison(comparison),
         pictures=[],
-        **list_gap_values(comparison),
+        tables=list_gap_tables(comparison),
+        symbols=SYMBOLS,
+        gap_name=format_gap,
     )
     assert "dropouts in the recording: long-4.0." in page
 
@@ -205,8 +217,9 @@ def test_a_run_with_dropouts_is_left_out_and_named(capsys: pytest.CaptureFixture
 def test_a_channel_that_is_missing_gives_no_number() -> None:
     runs = make_runs()
     for run in runs:
-        for window in run.summary["windows"]:
-            window["measured"]["force_r"]["peak"] = None
+        windows: Any = run.summary.windows
+        for window in windows:
+            window.measured.force_r.peak = None
     comparison = compare(runs)
     assert np.isnan(comparison.values["measured", "r"]).all()
     assert rank_gaps(comparison, "measured", "r") is None
@@ -233,7 +246,7 @@ def test_records_are_distinguished_by_their_motion(tmp_path: Path) -> None:
     stopped = (
         "stopped",
         make_profile("first.csv", 1.0, math.inf),
-        {**summary, "verdict": "stopped"},
+        summary.model_copy(update={"verdict": "stopped"}),
     )
     listed = list_record_runs([*runs, stopped], {})
     assert [run.record for run in listed] == ["own × 1", "own × 1", "own × 0.5", "first"]
@@ -250,13 +263,8 @@ def test_records_are_distinguished_by_their_motion(tmp_path: Path) -> None:
 def test_the_terminal_shows_the_table_and_the_best_gaps(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    entry = json.loads(json.dumps(describe_comparison(compare(make_runs()))))
-    for place in (entry["gaps"], *entry["best"].values()):  # as summary.json has it
-        for row in place if isinstance(place, list) else place.values():
-            for key in ("gap_mm", "next_gap_mm"):
-                if row.get(key) == math.inf:
-                    row[key] = None
-    print_gap_comparison(entry)
+    described = describe_comparison(compare(make_runs()))
+    print_gap_comparison(GapResult.model_validate_json(described.to_json()))
     text = " ".join(capsys.readouterr().out.split())
     assert "G4: 0.80, best in 2 of 3 records; next G0: 0.90 (+13 %)" in text
     assert "G0, the smallest gap tested: 0.20, best in 3 of 3 records" in text
@@ -297,8 +305,9 @@ def test_the_lines_of_the_figures_are_the_values() -> None:
 def test_without_displacement_no_trade_off_is_drawn() -> None:
     runs = make_runs()
     for run in runs:
-        for window in run.summary["windows"]:
-            window["measured"]["u"]["peak"] = None
+        windows: Any = run.summary.windows
+        for window in windows:
+            window.measured.u.peak = None
     (over_gap,) = draw_gap_figures(compare(runs))
     assert over_gap.name == "gaps"
 
@@ -452,9 +461,9 @@ def test_only_the_records_of_a_campaign_are_simulated(
     path = write_grid(tmp_path, SHORT_GRID + '[[runs]]\nprofile = "sweep.toml"\n', BASE)
     simulated = []
 
-    def simulate(config: RunConfig) -> Json:
+    def simulate(config: RunConfig) -> tuple[RunSummary, list[str]]:
         simulated.append(config.name)
-        return {"verdict": "complete", "windows": make_summary(0.01, 1.0, 100.0)["windows"]}
+        return make_summary(0.01, 1.0, 100.0), []
 
     monkeypatch.setattr(simulate_grid, "simulate_peaks", simulate)
     assert simulate_profile(path, [], [], None, tmp_path / "model", False) == 0

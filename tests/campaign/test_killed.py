@@ -236,7 +236,7 @@ def test_lines_and_points_of_the_pictures_are_divided_by_the_same(both: Both) ->
 def test_a_gap_without_a_measured_step_is_not_drawn(both: Both) -> None:
     campaign = read_campaign(both.killed)
     free, *others = campaign.runs
-    unmeasured = replace(free, summary=free.summary | {"steps": []})
+    unmeasured = replace(free, summary=free.summary.model_copy(update={"steps": []}))
     cases, measured = prc_families(replace(campaign, runs=(unmeasured, *others)))
     assert list(cases) == list(measured.points) == ["G4"]
     caption = draw_all_gaps(cases, measured).caption

@@ -1,15 +1,14 @@
 """Tracking error: what is put into a motion is found again, and nothing lost is invented."""
 
 import math
-from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from table_io.block import Float1D
+from twin.results.contracts import TrackingError
 from twin.results.spectra import compute_response_spectrum, list_octave_frequencies
 from twin.results.tracking import (
-    TrackingError,
     compare_spectra,
     delay_record,
     find_band,
@@ -125,7 +124,7 @@ def test_rest_before_and_after_changes_nothing() -> None:
     padded = [np.concatenate([rest, record, rest]) for record in (TARGET, achieved)]
     first = judge_tracking(TARGET, achieved, RATE_HZ, BAND_HZ)
     second = judge_tracking(padded[0], padded[1], RATE_HZ, BAND_HZ)
-    for name, value in asdict(first).items():
+    for name, value in dict(first).items():
         if isinstance(value, float) and math.isfinite(value):
             assert getattr(second, name) == pytest.approx(value, rel=1e-3, abs=1e-6), name
 
@@ -186,4 +185,4 @@ def test_every_number_is_there() -> None:
         TARGET, TARGET, RATE_HZ, BAND_HZ, target_disp=TARGET, achieved_disp=TARGET
     )
     assert isinstance(result, TrackingError)
-    assert all(np.isfinite(value).all() for value in asdict(result).values())
+    assert all(np.isfinite(value).all() for value in dict(result).values())

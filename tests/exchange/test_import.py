@@ -55,8 +55,8 @@ def whole(recording: Recording) -> Block:
     return piece
 
 
-def steps(recording: Recording) -> list[dict[str, Any]]:
-    return summarise(recording, read_recorded_config(recording).parameters)["steps"]
+def steps(recording: Recording) -> Any:
+    return summarise(recording, read_recorded_config(recording).parameters).steps
 
 
 def read_warnings(recording: Recording) -> str:
@@ -92,13 +92,14 @@ def test_prc_of_an_import_is_that_of_the_run(
     run: tuple[Path, Recording], imported_log: Recording
 ) -> None:
     for ours, theirs in zip(steps(run[1]), steps(imported_log), strict=True):
-        assert ours["frequency_hz"] == theirs["frequency_hz"]
-        assert ours["direction"] == theirs["direction"]
+        assert ours.frequency_hz == theirs.frequency_hz
+        assert ours.direction == theirs.direction
         # At the jump the motion is no steady one, and a sample earlier is another motion.
-        near = 5e-3 if ours["measured"]["spread"] > 0.02 else 1e-3
+        near = 5e-3 if ours.measured.spread > 0.02 else 1e-3
         for key in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
-            assert theirs["measured"][key] == pytest.approx(ours["measured"][key], rel=near)
-        assert ours["measured"]["impacts_right"] == theirs["measured"]["impacts_right"]
+            expected = getattr(ours.measured, key)
+            assert getattr(theirs.measured, key) == pytest.approx(expected, rel=near)
+        assert ours.measured.impacts_right == theirs.measured.impacts_right
 
 
 def test_prc_and_replay_read_an_imported_log(

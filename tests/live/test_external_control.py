@@ -17,6 +17,7 @@ from table_io.records import RunStart, Timing
 from table_io.sim.opendaq import OpenDaqServer
 from tests.input_errors import raises_input_error
 from twin.live.twin_process import TwinProcess
+from twin.results.contracts import Latency
 from twin.results.summary import summarise_timing
 from twin.setup.disk import bytes_per_s, planned_bytes
 from twin.setup.run_config import compile_rig_kernels, read_run_config
@@ -64,7 +65,7 @@ def test_held_back_blocks_have_no_latency(follows: bool) -> None:
 
 def test_histogram_without_blocks_has_no_latency() -> None:
     timing = summarise_timing((Timing(0, "twin", 0.0, 0.0, 0.0, 0, 0, 0.1, "normal"),))
-    assert timing["latency_ms"] == {"p50": None, "p99": None, "max": None}
+    assert timing.latency_ms == Latency(p50=None, p99=None, max=None)
 
 
 def test_malformed_address_is_reported() -> None:

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import ReplayComparison, replay_recording
-from twin.results.summary import dump_strict_json, summarise
+from twin.results.summary import summarise
 from twin.setup.run_config import RunConfig, from_texts, read_run_config
 from twin.setup.unpaced import simulate_ideal
 from twin.transport.codec import Item, encode_item
@@ -93,11 +94,11 @@ def test_a_stiffer_model_differs_and_is_worse(
     assert identity.largest["rel_disp_m"] > 0
     assert made.start.model_toml == other.model_toml
     assert made.records(Params)[0].values["stiffness"] == 37800.0
-    before = summarise(recording, bundle.parameters)["comparison"]
-    after = summarise(made, other.parameters)["comparison"]
+    before: Any = summarise(recording, bundle.parameters).comparison
+    after: Any = summarise(made, other.parameters).comparison
     for name in ("rel_disp_m", "mass_acc_m_s2"):
-        assert after[name]["nrmse"] > 2 * before[name]["nrmse"]
-        assert after[name]["free_nrmse"] > 2 * before[name]["free_nrmse"]
+        assert after[name].nrmse > 2 * before[name].nrmse
+        assert after[name].free_nrmse > 2 * before[name].free_nrmse
 
 
 def test_a_bit_in_the_recording_is_noticed(
@@ -242,20 +243,17 @@ def simulated_run(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -
 
 def test_a_simulation_has_measured_nothing(simulated_run: Recording, bundle: RunConfig) -> None:
     assert simulated_run.start.source == "model"
-    summary = summarise(simulated_run, bundle.parameters)
-    assert len(summary["steps"]) == 6
-    for step in summary["steps"]:
-        assert step["measured"] is None
-        assert step["twin"]["eta_d"] > 0
-        assert step["table_acc_fundamental_m_s2"] == pytest.approx(0.05 * 9.80665, rel=1e-3)
-        assert step["thd"] < 1e-3
+    summary: Any = summarise(simulated_run, bundle.parameters)
+    assert len(summary.steps) == 6
+    for step in summary.steps:
+        assert step.measured is None
+        assert step.twin.eta_d > 0
+        assert step.table_acc_fundamental_m_s2 == pytest.approx(0.05 * 9.80665, rel=1e-3)
+        assert step.thd < 1e-3
     assert all(point.measured is None for point in simulated_run.records(PrcPoint))
-    assert all(
-        {values[key] for key in ("nrmse", "free_nrmse")} == {None}
-        for values in summary["comparison"].values()
-    )
-    assert "NaN" not in dump_strict_json(summary)
-    assert summary["run"]["branches_from"] == "twin"
+    assert all({error.nrmse, error.free_nrmse} == {None} for error in summary.comparison.values())
+    assert "NaN" not in summary.to_json()
+    assert summary.run.branches_from == "twin"
 
 
 def test_a_simulated_point_is_that_of_physics_md(simulated_run: Recording) -> None:
@@ -282,15 +280,15 @@ def test_a_simulated_curve_of_free_flight_is_the_closed_form(
     (tmp_path / "free.toml").write_text(free)
     bundle = read_run_config(tmp_path / "free.toml")
     simulate_ideal(bundle, "free", tmp_path / "run.mcap", lambda _: None)
-    summary = summarise(read_recording(tmp_path / "run.mcap"), bundle.parameters)
+    summary: Any = summarise(read_recording(tmp_path / "run.mcap"), bundle.parameters)
     p = bundle.parameters
-    assert len(summary["steps"]) == 8
-    for step in summary["steps"]:
-        w = 2 * math.pi * step["frequency_hz"]
+    assert len(summary.steps) == 8
+    for step in summary.steps:
+        w = 2 * math.pi * step.frequency_hz
         u = 0.05 * 9.80665 / abs(complex(p.stiffness / p.mass - w**2, p.damping * w / p.mass))
-        assert step["twin"]["eta_d"] == pytest.approx(u / summary["u_star_m"], rel=2e-3)
-        assert (step["twin"]["r_r"], step["twin"]["eta_l"]) == (0, 0)
-    assert summary["jumps"] == summary["hysteresis"] == []
+        assert step.twin.eta_d == pytest.approx(u / summary.u_star_m, rel=2e-3)
+        assert (step.twin.r_r, step.twin.eta_l) == (0, 0)
+    assert summary.jumps == summary.hysteresis == []
 
 
 def test_a_simulation_predicts_from_its_first_sample(simulated_run: Recording) -> None:

@@ -12,10 +12,8 @@ import pytest
 from tests.reports.recordings import blocks, start_record, summary
 from twin.drawing import plot_style
 from twin.recording.mcap_log import write_items
-from twin.recording.reader import read_recording
 from twin.report import figures
-from twin.report.report import render_report
-from twin.results.report_data import build_report_data
+from twin.report.report import load_report_data, render_report
 from twin.transport.codec import Item
 
 Maker = Callable[..., Path]
@@ -73,7 +71,7 @@ def run_folder(tmp_path: Path) -> Maker:
 def drawn_report(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     """Drawn once, in full quality; to look at, not to write into."""
     folder = make(tmp_path_factory.mktemp("drawn"))
-    run = build_report_data(read_recording(folder / "run.mcap"), summary())
+    run = load_report_data(folder)
     pictures = figures.draw_run_figures(run, folder / "figures")
     return Drawn(folder, pictures, render_report(run, pictures))
 

@@ -4,17 +4,19 @@ import copy
 import json
 import math
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
 
 from table_io.records import Check, Fault, NormalizedResponse, Timing, Trip
+from tests.input_errors import raises_input_error
 from twin.compare.curves import Hysteresis, PrcJump
 from twin.discovery.result import FeatureVerdict, IdentificationReport, Verdict
 from twin.results import contracts
 from twin.results.contract import build_json_schema
-from twin.results.contracts import RunSummary, SummaryKeys
+from twin.results.contracts import RunSummary
 
 NAN = float("nan")
 INTERVAL = {"value": 60.0, "low": 58.0, "high": NAN, "unit": "N"}
@@ -90,11 +92,20 @@ def test_without_one_of_its_keys_it_is_not_written(key: str) -> None:
     assert [(e["loc"], e["type"]) for e in error.value.errors()] == [((key,), "missing")]
 
 
-def test_a_summary_of_another_version_is_read() -> None:
+def test_a_summary_of_another_version_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "summary.json"
     step = {"index": 0, "direction": "forward", "frequency_hz": 2.0, "later": 1}
-    SummaryKeys.model_validate({"run": {"x": 1}, "verdict": "complete", "steps": [step], "y": 2})
-    with pytest.raises(ValidationError):
-        SummaryKeys.model_validate({"run": {}, "verdict": "complete", "steps": [{"index": 0}]})
+    content: dict[str, Any] = {"run": {"x": 1}, "verdict": "complete", "steps": [step], "y": 2}
+    path.write_text(json.dumps(content))
+    summary = RunSummary.read(path, "")
+    assert summary.steps[0].measured is None
+    assert math.isnan(summary.steps[0].thd)
+    assert (summary.jumps, summary.twin_verdict, summary.run.title) == ([], None, "")
+    del step["later"], content["y"], content["run"]["x"]
+    assert json.loads(summary.to_json()) == content
+    path.write_text(json.dumps(content | {"steps": [{"index": 0}]}))
+    with raises_input_error(where=path, key="steps.0.direction"):
+        RunSummary.read(path, "")
 
 
 @pytest.mark.parametrize("contract", [RunSummary, Verdict, IdentificationReport, FeatureVerdict])

@@ -18,6 +18,8 @@ from twin.model.parameters import Parameters
 from twin.recording.columns import StoredItems
 from twin.recording.reader import read_recording
 from twin.report.figures import draw_run_figures
+from twin.report.report import load_report_data
+from twin.results.contracts import RunSummary
 from twin.results.report_data import (
     ReportData,
     build_report_data,
@@ -49,7 +51,7 @@ def test_steps_looked_at_are_hysteresis_peak_and_most_impacts(run_folder: Maker)
     values = summary()
     values["steps"][0]["measured"]["impacts_left"] = [4, 4, 4]
     folder = run_folder(run_summary=values)
-    reasons = select_frequencies(build_report_data(read_recording(folder / "run.mcap"), values))
+    reasons = select_frequencies(load_report_data(folder))
     assert reasons == {
         1.0: "largest excursion, most impacts per cycle",  # backward ends at 1 Hz, eta_d rises
         1.5: "inside the right hysteresis",
@@ -61,9 +63,7 @@ def test_pictures_show_measured_samples_and_leave_gaps_empty(run_folder: Maker) 
     whole = next(item for item in items if isinstance(item, Block) and item.step[0] == 1)
     parts = [whole.cut(whole.index, whole.index + 400), whole.cut(whole.index + 450, whole.end)]
     folder = run_folder([*(item for item in items if item is not whole), *parts])
-    motion = extract_step_motion(
-        build_report_data(read_recording(folder / "run.mcap"), summary()), "meas", 1
-    )
+    motion = extract_step_motion(load_report_data(folder), "meas", 1)
     assert motion is not None
     assert motion.u.size == len(whole)
     assert np.isnan(motion.u[400:450]).all()
@@ -75,16 +75,16 @@ def test_pictures_show_measured_samples_and_leave_gaps_empty(run_folder: Maker) 
 
 
 def test_errors_per_step_are_those_of_the_comparisons(run_folder: Maker) -> None:
-    errors = compute_step_errors(
-        build_report_data(read_recording(run_folder() / "run.mcap"), summary())
-    )
+    errors = compute_step_errors(load_report_data(run_folder()))
     assert errors["u"][0] == pytest.approx((0.1, 0.05))
     assert errors["F_R"][0] == pytest.approx((0.1, 0.05))
     assert np.isnan(errors["F_R"][7]).all()  # backward never touches
 
 
 def build_precompressed(folder: Path) -> ReportData:
-    return build_report_data(read_recording(folder / "run.mcap"), one_step()[1])
+    return build_report_data(
+        read_recording(folder / "run.mcap"), RunSummary.model_validate(one_step()[1])
+    )
 
 
 def test_precompression_is_that_of_the_recorded_model_or_of_its_card(run_folder: Maker) -> None:

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,8 +20,9 @@ from twin.monitor.run_view import RunView, SessionStatus
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.report.report import write_report
+from twin.results.contracts import OrbitResult, PlannedOrbitEntry
 from twin.results.orbits import find_measured_folds, read_planned_branch
-from twin.results.summary import parse_toml_tables, summarise, write_summary
+from twin.results.summary import parse_toml_tables, summarise
 from twin.system.progress import RunProgress
 from twin.transport.codec import decode_item, encode_item, topic_for
 from twin.viewer.plots import FrequencyCurves
@@ -78,23 +80,23 @@ def folder(tmp_path_factory):
     points = [make_point(0), make_point(1), make_point(2, "the feedback is 0.5 % of the command")]
     write_items(path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
     summary = summarise(read_recording(path / "run.mcap"), snm())
-    write_summary(summary, path / "summary.json")
+    summary.write(path / "summary.json")
     return path, summary
 
 
 def test_summary_has_each_orbit_with_its_feedback(folder):
-    orbits = folder[1]["orbits"]
-    assert [orbit["index"] for orbit in orbits] == [0, 1, 2]
-    assert [orbit["accepted"] for orbit in orbits] == [True, True, False]
-    assert orbits[1]["feedback_m"] == pytest.approx(5e-6)
-    assert orbits[1]["feedback_share"] == pytest.approx(5e-3)
-    assert orbits[1]["fundamental_m"] == pytest.approx(5e-4)
-    assert orbits[2]["planned"]["amplitude_m"] == pytest.approx(3 * AMPLITUDE_M, rel=1e-4)
-    assert orbits[2]["planned"]["multiplier"] == 5.0
+    orbits = folder[1].orbits
+    assert [orbit.index for orbit in orbits] == [0, 1, 2]
+    assert [orbit.accepted for orbit in orbits] == [True, True, False]
+    assert orbits[1].feedback_m == pytest.approx(5e-6)
+    assert orbits[1].feedback_share == pytest.approx(5e-3)
+    assert orbits[1].fundamental_m == pytest.approx(5e-4)
+    assert orbits[2].planned.amplitude_m == pytest.approx(3 * AMPLITUDE_M, rel=1e-4)
+    assert orbits[2].planned.multiplier == 5.0
     assert np.array_equal(
-        [orbit["multiplier"] for orbit in orbits], [np.nan, 4.123, np.nan], equal_nan=True
+        [orbit.multiplier for orbit in orbits], [np.nan, 4.123, np.nan], equal_nan=True
     )
-    assert [orbit["multiplier_sd"] for orbit in orbits] == [None, 0.07, None]
+    assert [orbit.multiplier_sd for orbit in orbits] == [None, 0.07, None]
 
 
 def test_progress_tells_measured_and_planned_orbits():
@@ -139,9 +141,9 @@ def test_report_of_a_backbone_shows_the_phase(tmp_path):
     start = make_start(profile)
     points = [make_point(0), make_point(1), make_point(2)]
     write_items(tmp_path / "run.mcap", [start, *points, RunStop(4000, "complete", "", ())], start)
-    summary = summarise(read_recording(tmp_path / "run.mcap"), snm())
-    write_summary(summary, tmp_path / "summary.json")
-    assert summary["orbits"][0]["phase_deg"] == pytest.approx(90.0 + np.degrees(np.arctan2(4, 3)))
+    summary: Any = summarise(read_recording(tmp_path / "run.mcap"), snm())
+    summary.write(tmp_path / "summary.json")
+    assert summary.orbits[0].phase_deg == pytest.approx(90.0 + np.degrees(np.arctan2(4, 3)))
     branch = read_planned_branch(parse_toml_tables(profile))
     assert branch is not None
     assert branch.is_backbone
@@ -172,44 +174,58 @@ def test_monitor_draws_orbits_in_place_of_the_curves():
     assert "3.2" in text
 
 
-def make_branch() -> list[dict]:
-    """Entries of orbits on f = 3 + 0.2 (A - 5)^2 below 6 mm and f = 3.4 - 0.1 (A - 7)^2 above."""
+def make_branch() -> list[OrbitResult]:
+    """Orbits on f = 3 + 0.2 (A - 5)^2 below 6 mm and f = 3.4 - 0.1 (A - 7)^2 above."""
     amplitudes = np.arange(4.45, 7.6, 0.1)
     frequencies = np.where(
         amplitudes < 6.0, 3.0 + 0.2 * (amplitudes - 5) ** 2, 3.4 - 0.1 * (amplitudes - 7) ** 2
     )
+    orbit = OrbitResult(
+        index=0, frequency_hz=3.0, acceleration_m_s2=0.5, amplitude_m=1e-3, fundamental_m=1e-3,
+        phase_deg=90.0, feedback_m=0.0, feedback_share=0.0, feedback_harmonics_m=[], noise_m=0.0,
+        periods=10, updates=1, accepted=True, reason="", stable=True, multiplier=1.0,
+        multiplier_sd=None,
+        planned=PlannedOrbitEntry(frequency_hz=3.0, amplitude_m=1e-3, multiplier=1.0),
+    )  # fmt: skip
     return [
-        {
-            "accepted": True, "stable": not 5.0 < amplitude < 7.0,
-            "amplitude_m": 1e-3 * amplitude, "frequency_hz": frequency,
-        }
+        orbit.model_copy(
+            update={
+                "stable": not 5.0 < amplitude < 7.0,
+                "amplitude_m": 1e-3 * amplitude,
+                "frequency_hz": frequency,
+            }
+        )
         for amplitude, frequency in zip(amplitudes, frequencies, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def test_folds_are_where_the_measured_branch_turns():
     lower, upper = find_measured_folds(make_branch())
-    assert (lower["kind"], upper["kind"], lower["orbits"]) == ("lower", "upper", 4)
-    assert lower["frequency_hz"] == pytest.approx(3.0, abs=1e-6)
-    assert upper["frequency_hz"] == pytest.approx(3.4, abs=1e-6)
-    assert upper["amplitude_m"] == pytest.approx(7e-3, rel=1e-6)
+    assert (lower.kind, upper.kind, lower.orbits) == ("lower", "upper", 4)
+    assert lower.frequency_hz == pytest.approx(3.0, abs=1e-6)
+    assert upper.frequency_hz == pytest.approx(3.4, abs=1e-6)
+    assert upper.amplitude_m == pytest.approx(7e-3, rel=1e-6)
 
 
 def test_no_fold_is_stated_where_too_little_was_measured():
     branch = make_branch()
-    unstable = [orbit for orbit in branch if not orbit["stable"]]
+    unstable = [orbit for orbit in branch if not orbit.stable]
     assert find_measured_folds(unstable) == []
     assert find_measured_folds([unstable[-1], *branch[-1:]]) == []
-    refused = [orbit | {"accepted": orbit["amplitude_m"] < 5.2e-3} for orbit in branch]
-    assert [fold["kind"] for fold in find_measured_folds(refused)] == ["lower"]
+    refused = [
+        orbit.model_copy(update={"accepted": orbit.amplitude_m < 5.2e-3}) for orbit in branch
+    ]
+    assert [fold.kind for fold in find_measured_folds(refused)] == ["lower"]
 
 
 def test_no_fold_is_stated_far_from_the_measured_orbits():
     sparse = make_branch()[1::9]
-    assert {orbit["stable"] for orbit in sparse} == {True, False}
+    assert {orbit.stable for orbit in sparse} == {True, False}
     assert find_measured_folds(sparse) == []
 
 
 def test_a_branch_that_does_not_turn_where_the_plan_says_has_no_fold_there():
-    branch = [orbit | {"stable": orbit["amplitude_m"] < 5.7e-3} for orbit in make_branch()]
+    branch = [
+        orbit.model_copy(update={"stable": orbit.amplitude_m < 5.7e-3}) for orbit in make_branch()
+    ]
     assert find_measured_folds(branch) == []

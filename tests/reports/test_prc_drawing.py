@@ -18,13 +18,14 @@ from twin.drawing.prc_drawing import (
     make_prc_panels,
     plot_prc,
 )
+from twin.results.contracts import RunSummary
 from twin.results.report_data import extract_prc
 from twin.results.summary import prc_points
 
 
 @pytest.fixture
 def points() -> list[PrcPoint]:
-    return prc_points(summary()["steps"])
+    return prc_points(RunSummary.model_validate(summary()).steps)
 
 
 @pytest.fixture

@@ -1,7 +1,6 @@
 """The report of a run: what it shows is what was recorded, whatever is missing."""
 
 import csv
-import json
 import math
 import re
 from dataclasses import replace
@@ -20,8 +19,7 @@ from twin.campaign import STATE_FILE
 from twin.drawing.page import format_significant
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
-from twin.report.report import render_report, write_report
-from twin.results.report_data import build_report_data
+from twin.report.report import load_report_data, render_report, write_report
 from twin.transport.codec import Item
 
 pytestmark = pytest.mark.usefixtures("draft")
@@ -33,8 +31,7 @@ def page(folder: Path) -> str:
 
 def bare(folder: Path) -> str:
     """The page without its pictures, which take their time."""
-    run_summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-    return render_report(build_report_data(read_recording(folder / "run.mcap"), run_summary), [])
+    return render_report(load_report_data(folder), [])
 
 
 def words(html: str) -> str:

@@ -47,7 +47,19 @@ def make_summary(number: int) -> dict[str, Any]:
         "estimates": {"stiffness": estimate, "damping": estimate | {"value": 1100.0}},
         "warnings": [{"at_s": 1.0, "kind": "drift", "text": ""}] * number,
         "run": values["run"] | {"started_at": f"2025-01-0{1 + number}T10:00:00", "gap_m": 0.004},
-        "twin_verdict": {"verdict": "departs" if number else "agrees", "misfit": 1.0 + number},
+        "twin_verdict": {
+            "verdict": "departs" if number else "agrees",
+            "misfit": 1.0 + number,
+            "reason": "",
+            "tolerance": "",
+            "worst": None,
+            "steps_outside": 0,
+            "steps_judged": 8,
+            "missing_jumps": [],
+            "unexpected_jumps": [],
+            "warnings": 0,
+            "next_command": "",
+        },
     }
 
 
@@ -162,8 +174,8 @@ def test_two_runs_are_compared(comparable: list[Path]) -> None:
 def test_estimates_beside_two_models_have_no_standard_deviations(comparable: list[Path]) -> None:
     runs = [_load_run(path) for path in comparable]
     other = replace(runs[1], parameters={**runs[1].parameters, "coulomb_friction.fc": 50.0})
-    stiffness, _ = compare_summaries(runs[0], other)["estimates"]
-    assert (stiffness["change"], stiffness["sigma"], stiffness["changed"]) == (2e3, None, False)
+    stiffness, _ = compare_summaries(runs[0], other).estimates
+    assert (stiffness.change, stiffness.sigma, stiffness.changed) == (2e3, None, False)
 
 
 @pytest.mark.usefixtures("draft")

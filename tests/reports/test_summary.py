@@ -27,7 +27,9 @@ from table_io.records import (
 from twin.compare import COMPARED_CHANNELS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
-from twin.results.summary import dump_strict_json, summarise, write_summary
+from twin.results.contract import format_json
+from twin.results.contracts import ChannelError, RunSummary
+from twin.results.summary import summarise
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
@@ -68,8 +70,8 @@ def recording(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> Re
 def summary_of(items: list[Item], recording: Recording, bundle: RunConfig, folder: Path) -> Any:
     """What a user reads of a recording with these items: parsed from the text, strictly."""
     write_items(folder / "made.mcap", items, recording.start)
-    write_summary(
-        summarise(read_recording(folder / "made.mcap"), bundle.parameters), folder / "summary.json"
+    summarise(read_recording(folder / "made.mcap"), bundle.parameters).write(
+        folder / "summary.json"
     )
     return strict((folder / "summary.json").read_text())
 
@@ -178,7 +180,7 @@ def test_the_last_timing_of_each_component_counts(
 
 def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -> None:
     """Directly from the recorded samples, over those that both have."""
-    comparison = summarise(recording, bundle.parameters)["comparison"]
+    comparison = summarise(recording, bundle.parameters).comparison
     measured, predicted = (
         recording.contiguous_blocks("meas")[0],
         recording.contiguous_blocks("pred")[0],
@@ -193,7 +195,7 @@ def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -
             # the motion of the table is measured: only that relative to it is a prediction
             size = u[cells] if name == "mass_disp_m" else x
             want = math.sqrt((error**2).sum() / (size**2).sum())
-            assert comparison[name][key] == pytest.approx(want, rel=1e-9)
+            assert getattr(comparison[name], key) == pytest.approx(want, rel=1e-9)
         # white noise of the card would leave this of a perfect model
         at_rest = np.cumsum(measured.label != Label.REST) == 0
         lasers = np.array([measured.channel(n)[at_rest] for n in ("mass_disp_m", "table_disp_m")])
@@ -201,7 +203,7 @@ def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -
             math.hypot(*lasers.std(axis=1))
         )  # fmt: skip
         floor = noise * math.sqrt(x.size / (size**2).sum())
-        assert comparison[name]["noise_floor"] == pytest.approx(floor, rel=0.2)
+        assert comparison[name].noise_floor == pytest.approx(floor, rel=0.2)
 
 
 def test_a_lost_channel_is_null_and_the_others_stay(
@@ -217,20 +219,20 @@ def test_a_lost_channel_is_null_and_the_others_stay(
         else:
             items.append(item)
     comparison = summary_of(items, recording, bundle, tmp_path)["comparison"]
-    whole = summarise(recording, bundle.parameters)["comparison"]
+    whole = summarise(recording, bundle.parameters).comparison
     assert comparison["force_r1_n"] == dict.fromkeys(("nrmse", "free_nrmse", "noise_floor"))
-    assert comparison["force_r2_n"] == whole["force_r2_n"]
+    assert comparison["force_r2_n"] == whole["force_r2_n"].to_plain()
 
 
 def test_load_cells_without_bumpers_have_nothing_to_compare(
     recording: Recording, bundle: RunConfig
 ) -> None:
     parameters = replace(bundle.parameters, gap_r=math.inf)
-    comparison = summarise(recording, parameters)["comparison"]
+    comparison = summarise(recording, parameters).comparison
     for name in CELLS[:2]:
-        assert comparison[name] == dict.fromkeys(("nrmse", "free_nrmse", "noise_floor"))
+        assert comparison[name] == ChannelError(nrmse=None, free_nrmse=None, noise_floor=None)
     for name in (*CELLS[2:], "rel_disp_m"):
-        assert comparison[name]["nrmse"] > 0
+        assert (comparison[name].nrmse or 0.0) > 0
 
 
 # Jumps and hysteresis
@@ -276,7 +278,7 @@ def test_a_dead_twin_leaves_what_was_measured(
     ]
     summary = summary_of([*kept, fault], recording, bundle, tmp_path)
     assert [step["index"] for step in summary["steps"]] == [0, 1, 2, 3]
-    whole = summarise(recording, bundle.parameters)["steps"]
+    whole = summarise(recording, bundle.parameters).to_plain()["steps"]
     assert summary["steps"][1]["twin"] is None
     assert summary["steps"][1]["measured"] == json.loads(json.dumps(whole[1]["measured"]))
     assert summary["steps"][1]["thd"] == whole[1]["thd"]
@@ -337,7 +339,7 @@ def test_gaps_and_lost_samples_are_counted(
 
 
 def test_what_is_no_number_is_null() -> None:
-    text = dump_strict_json(
+    text = format_json(
         {"a": math.nan, "b": [math.inf, {"c": (-math.inf, 1.0)}], "d": np.float64("nan")}
     )
     assert strict(text) == {"a": None, "b": [None, {"c": [None, 1.0]}], "d": None}
@@ -365,15 +367,20 @@ def test_a_lost_start_record_is_taken_from_its_copy(recording: Recording, tmp_pa
     assert "/run/start: lost" in damage.reason
 
 
-def test_a_key_that_the_contract_does_not_know_is_not_written(
+def test_a_summary_that_is_read_again_is_written_as_it_was(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    summary = summarise(recording, bundle.parameters)
-    write_summary(summary, tmp_path / "summary.json")
-    assert (tmp_path / "summary.json").read_text() == dump_strict_json(summary) + "\n"
-    step = {**summary["steps"][0], "mood": "good"}
-    without_gaps = {key: value for key, value in summary.items() if key != "gaps"}
-    for wrong in ({**summary, "steps": [step]}, {**summary, "mood": "good"}, without_gaps):
+    path, again = tmp_path / "summary.json", tmp_path / "again.json"
+    summarise(recording, bundle.parameters).write(path)
+    RunSummary.read(path, "").write(again)
+    assert again.read_text() == path.read_text()
+
+
+def test_a_key_that_the_contract_does_not_know_is_not_written(
+    recording: Recording, bundle: RunConfig
+) -> None:
+    plain = summarise(recording, bundle.parameters).to_plain()
+    step = {**plain["steps"][0], "mood": "good"}
+    for wrong in ({**plain, "steps": [step]}, {**plain, "mood": "good"}):
         with pytest.raises(ValidationError):
-            write_summary(wrong, tmp_path / "other.json")
-    assert not (tmp_path / "other.json").exists()
+            RunSummary.model_validate(wrong)

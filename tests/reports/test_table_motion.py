@@ -2,7 +2,6 @@
 
 import json
 import re
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +18,15 @@ from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.report.report import write_report
-from twin.results.contracts import RunSummary, TrackingResult
 from twin.results.spectra import compute_response_spectrum
-from twin.results.summary import dump_contract, format_summary, write_summary
+from twin.results.summary import format_summary
 from twin.results.table_motion import (
     find_table_motion,
     format_tracking,
     list_required_frequencies,
     summarise_tracking,
 )
-from twin.results.tracking import TrackingError, judge_tracking
+from twin.results.tracking import judge_tracking
 
 
 @pytest.fixture(scope="module")
@@ -61,10 +59,10 @@ def test_the_target_is_the_command_where_the_windows_begin(run: Run) -> None:
     part = block.cut(motion.first, motion.first + motion.target_disp_m.size)
     assert np.abs(part.channel("drive_disp_m") - motion.target_disp_m).max() < 2e-6
     assert np.array_equal(motion.achieved_acc_m_s2, part.channel("table_acc_m_s2"))
-    windows = summary["windows"]
+    windows = summary.windows
     assert (motion.start, motion.end) == (
-        round(windows[0]["from_s"] * motion.rate_hz),
-        round(windows[-1]["to_s"] * motion.rate_hz),
+        round(windows[0].from_s * motion.rate_hz),
+        round(windows[-1].to_s * motion.rate_hz),
     )
     assert motion.first < motion.start  # with rest before and after
     assert motion.first + motion.target_disp_m.size > motion.end
@@ -72,9 +70,9 @@ def test_the_target_is_the_command_where_the_windows_begin(run: Run) -> None:
 
 def test_the_summary_has_the_error_of_the_recorded_motion(run: Run) -> None:
     _, recording, summary = run
-    tracking = summary["tracking"]
+    tracking = summary.tracking
     block = join_blocks(recording.contiguous_blocks("meas"))
-    first, end = (round(tracking[key] * block.rate_hz) for key in ("from_s", "to_s"))
+    first, end = (round(at_s * block.rate_hz) for at_s in (tracking.from_s, tracking.to_s))
     command = read_profile(recording).plan.history_m
     assert command.size == end - first
     achieved = block.channel("table_disp_m")[first:end]
@@ -85,23 +83,18 @@ def test_the_summary_has_the_error_of_the_recorded_motion(run: Run) -> None:
         for lag in np.arange(20.0, 45.0, 0.25)
     }
     lag = min(errors, key=lambda shift: errors[shift])
-    assert tracking["lag_s"] == pytest.approx(lag / block.rate_hz, abs=1e-3)
-    lag = tracking["lag_s"] * block.rate_hz  # that of the acceleration
+    assert tracking.lag_s == pytest.approx(lag / block.rate_hz, abs=1e-3)
+    lag = tracking.lag_s * block.rate_hz  # that of the acceleration
     error = np.sum((achieved - np.interp(index - lag, index, command)) ** 2)
     expected = np.sqrt(error / np.sum(command**2))
-    assert tracking["disp_rms_error_full"] == pytest.approx(expected, rel=0.05)
+    assert tracking.disp_rms_error_full == pytest.approx(expected, rel=0.05)
     acceleration = block.channel("table_acc_m_s2")[first:end]
     target = np.diff(command, 2) * block.rate_hz**2
     ratio = np.abs(acceleration).max() / np.abs(target).max()
-    assert tracking["pga_ratio_full"] == pytest.approx(ratio, rel=1e-3)
-    assert tracking["acc_rms_error_band"] < tracking["acc_rms_error_full"] < 0.2
-    assert tracking["sa_share"] == 1.0
-    assert tracking["required_spectrum"] is None
-
-
-def test_the_entry_has_every_number_of_the_judgement() -> None:
-    keys = {field.name for field in fields(TrackingError)}
-    assert TrackingResult.model_fields.keys() == keys | {"from_s", "to_s", "required_spectrum"}
+    assert tracking.pga_ratio_full == pytest.approx(ratio, rel=1e-3)
+    assert tracking.acc_rms_error_band < tracking.acc_rms_error_full < 0.2
+    assert tracking.sa_share == 1.0
+    assert tracking.required_spectrum is None
 
 
 def test_band_and_damping_are_those_of_the_profile(run: Run) -> None:
@@ -110,12 +103,12 @@ def test_band_and_damping_are_those_of_the_profile(run: Run) -> None:
     tracking, motion = summarise_tracking(recording, profile), find_table_motion(recording, profile)
     assert tracking is not None
     assert motion is not None
-    assert (tracking["band_hz"], tracking["damping"]) == ([0.5, 5.0], 0.02)
+    assert (tracking.band_hz, tracking.damping) == ((0.5, 5.0), 0.02)
     error = judge_tracking(
         motion.target_acc_m_s2, motion.achieved_acc_m_s2, motion.rate_hz, (0.5, 5.0), damping=0.02
     )
-    assert tracking["sa_worst_ratio"] == error.sa_worst_ratio
-    assert tracking["sa_count"] == error.sa_count == 20
+    assert tracking.sa_worst_ratio == error.sa_worst_ratio
+    assert tracking.sa_count == error.sa_count == 20
 
 
 @pytest.mark.parametrize(
@@ -129,10 +122,10 @@ def test_a_required_spectrum_is_checked(
     profile = read_profile(recording, **write_spectrum(recording, factor))
     tracking = summarise_tracking(recording, profile)
     assert tracking is not None
-    required = tracking["required_spectrum"]
-    assert (required["count"], required["outside"], required["passed"]) == (19, outside, passed)
-    for key in ("lowest_ratio", "highest_ratio"):
-        assert required[key] == pytest.approx(1 / factor, rel=1e-6)
+    required: Any = tracking.required_spectrum
+    assert (required.count, required.outside, required.passed) == (19, outside, passed)
+    for ratio in (required.lowest_ratio, required.highest_ratio):
+        assert ratio == pytest.approx(1 / factor, rel=1e-6)
     word = "met" if passed else "missed at 19 of 19 ordinates"
     assert format_tracking(tracking).endswith(f"required spectrum {word}")
 
@@ -149,8 +142,9 @@ def test_a_spectrum_beyond_the_sampling_rate_is_checked_as_far_as_it_goes(run: R
     )
     tracking = summarise_tracking(recording, profile)
     assert tracking is not None
-    assert tracking["required_spectrum"]["count"] == 0
-    assert not tracking["required_spectrum"]["passed"]
+    assert tracking.required_spectrum is not None
+    assert tracking.required_spectrum.count == 0
+    assert not tracking.required_spectrum.passed
     assert "not checked" in format_tracking(tracking)
 
 
@@ -159,37 +153,38 @@ def test_the_last_line_states_rms_pga_and_spectrum(run: Run) -> None:
     line = format_summary(summary, 0)
     assert re.search(r"acceleration [\d.]+ % RMS off its target in [\d.]+ to [\d.]+ Hz", line)
     assert re.search(r"PGA [\d.]+ % of it", line)
-    assert f"{summary['tracking']['sa_count']} SA within 10 %" in line
+    assert f"{summary.tracking.sa_count} SA within 10 %" in line
     assert re.search(r"lag 1\d\.\d ms", line)
 
 
 def test_a_test_that_was_stopped_is_judged_as_far_as_it_went(tmp_path: Path) -> None:
     _, _, summary = play_run(tmp_path, NO_CHECK, stop_at=round(4.56 * 2000))
-    tracking = summary["tracking"]
-    assert summary["verdict"] == "stopped"
-    assert tracking["to_s"] == summary["windows"][-1]["to_s"]
-    assert tracking["to_s"] < 5.5
-    assert tracking["acc_rms_error_full"] < 0.2
-    assert tracking["pga_ratio_full"] == pytest.approx(1.0, abs=0.1)
+    tracking = summary.tracking
+    assert summary.verdict == "stopped"
+    assert tracking.to_s == summary.windows[-1].to_s
+    assert tracking.to_s < 5.5
+    assert tracking.acc_rms_error_full < 0.2
+    assert tracking.pga_ratio_full == pytest.approx(1.0, abs=0.1)
 
 
 def test_lost_samples_are_stated_and_the_spectra_are_not(tmp_path: Path) -> None:
     rig = f'{RIG}\n[[simulated.faults]]\nat_s = 4.0\nfor_s = 0.005\nkind = "dropped"\n'
     _, recording, summary = play_run(tmp_path, NO_CHECK, rig)
-    tracking = summary["tracking"]
-    assert summary["verdict"] == "complete"
-    assert tracking["lost_samples"] == 10
-    assert tracking["acc_rms_error_full"] < 0.2
-    assert np.isnan(tracking["sa_share"])
-    assert json.loads(dump_contract(RunSummary, summary))["tracking"]["sa_share"] is None
+    tracking = summary.tracking
+    assert summary.verdict == "complete"
+    assert tracking.lost_samples == 10
+    assert tracking.acc_rms_error_full < 0.2
+    assert np.isnan(tracking.sa_share)
+    assert json.loads(summary.to_json())["tracking"]["sa_share"] is None
     assert "10 samples lost" in format_tracking(tracking)
     profile = read_profile(recording, required_spectrum="x", files={
         "x": "frequency_hz,sa_g\n1,1\n8,1\n"
     })  # fmt: skip
     again = summarise_tracking(recording, profile)
     assert again is not None
-    assert not again["required_spectrum"]["passed"]
-    write_summary(summary, tmp_path / "summary.json")
+    assert again.required_spectrum is not None
+    assert not again.required_spectrum.passed
+    summary.write(tmp_path / "summary.json")
     page = write_report(tmp_path, recording).read_text()
     assert "10 samples of the table" in page
     names = {path.stem for path in (tmp_path / "figures").glob("*.png")}
@@ -199,7 +194,7 @@ def test_lost_samples_are_stated_and_the_spectra_are_not(tmp_path: Path) -> None
 def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -> None:
     """The windows that are left do not say where the history began."""
     _, recording, summary = run
-    first = round(summary["tracking"]["from_s"] * recording.start.rate_hz)
+    first = round(summary.tracking.from_s * recording.start.rate_hz)
     blocks = [block for block in recording.blocks("meas") if block.index > first + 500]
     write_items(tmp_path / "run.mcap", list(blocks), recording.start)
     late = read_recording(tmp_path / "run.mcap")
@@ -213,7 +208,7 @@ def test_the_report_has_a_section_with_its_figures(run: Run) -> None:
     profile = read_profile(recording, **table)
     folder = recording.path.parent
     tracking = summarise_tracking(recording, profile)
-    write_summary(summary | {"tracking": tracking}, folder / "summary.json")
+    summary.model_copy(update={"tracking": tracking}).write(folder / "summary.json")
     page = write_report(folder, recording).read_text()
     section = page[page.index('<section id="table_motion">') :]
     section = section[: section.index("</section>")]
@@ -225,6 +220,6 @@ def test_the_report_has_a_section_with_its_figures(run: Run) -> None:
     assert "Required spectrum missed at 1" in section
     assert "allowed at least 0.9." in section
     assert "at 2.5 % damping" in section
-    assert f"{summary['tracking']['sa_count']} ordinates" in section
+    assert f"{summary.tracking.sa_count} ordinates" in section
     for name in MOTION_FIGURES:
         assert (folder / "figures" / f"{name}.png").stat().st_size > 20_000

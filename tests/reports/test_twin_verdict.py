@@ -17,7 +17,8 @@ from table_io.records import NormalizedResponse, PrcPoint
 from tests.builders.rigs import RIG_TEXT
 from twin.compare.monitoring.cycle import ChannelNoise
 from twin.recording.reader import read_recording
-from twin.results.summary import Json, summarise, write_summary
+from twin.results.contracts import RunSummary, TwinVerdict
+from twin.results.summary import summarise
 from twin.results.twin_verdict import (
     _add_cycles,
     _median_half_range,
@@ -28,6 +29,7 @@ from twin.results.twin_verdict import (
 from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced
 
+Json = dict[str, Any]
 TEST = """
 title = "{name}"
 rig = "{rig}"
@@ -76,7 +78,7 @@ def run_test(
     config = read_run_config(folder / "test.toml")
     play_unpaced(config, "test", folder / "run.mcap", lambda: None, lambda _: None)
     recording = read_recording(folder / "run.mcap")
-    write_summary(summarise(recording, config.parameters), folder / "summary.json")
+    summarise(recording, config.parameters).write(folder / "summary.json")
     return dict(json.loads((folder / "summary.json").read_text()))
 
 
@@ -131,7 +133,7 @@ def test_a_step_with_a_sensor_off_its_range_is_not_judged(
 
 
 def judge_changed(clean: Json, **entries: Any) -> Json:
-    return judge_twin(deepcopy(clean) | entries)
+    return judge_twin(RunSummary.model_validate(deepcopy(clean) | entries)).to_plain()
 
 
 @pytest.mark.parametrize(
@@ -219,7 +221,7 @@ def test_the_free_twin_is_on_the_branch_by_amplitude_and_phase(
     point = PrcPoint(100, 0, "forward", 2.0, measured, twin, 0.5, 0.5, 0.0)
     branch = compare_branches(point, free_error, ChannelNoise(), 0.03)
     assert branch is not None
-    assert branch["is_same"] == is_same
+    assert branch.is_same == is_same
 
 
 def test_a_jump_that_only_the_twin_has_is_missing(clean: Json) -> None:
@@ -316,5 +318,5 @@ def test_a_spike_does_not_widen_the_travel() -> None:
 
 
 def test_the_next_command_quotes_the_folder(clean: Json) -> None:
-    command = name_command(clean["twin_verdict"], Path("my runs/first"))
+    command = name_command(TwinVerdict.model_validate(clean["twin_verdict"]), Path("my runs/first"))
     assert command == "shaketwin view 'my runs/first'"

@@ -14,7 +14,6 @@ import pytest
 
 from tests.command_line import call_main
 from twin.demo.command import FIRST_RUN, read_twin_error, seal_effect
-from twin.results.summary import Json
 
 SEEDS = (1, 2, 3, 5, 7, 11)
 MORE_SEEDS = tuple(range(12, 36))
@@ -42,7 +41,7 @@ def read_page(path: Path) -> str:
 def check_surfaces(seed: int) -> None:
     folder, console = run_demo_rig(seed)
     run = folder / FIRST_RUN
-    summary: Json = json.loads((run / "summary.json").read_text())
+    summary = json.loads((run / "summary.json").read_text())
     twin, excitation = summary["twin_verdict"], summary["excitation_verdict"]
     words = f"{twin['verdict']}: {twin['reason']}"
     misfit = f"{twin['misfit']:.2g} times the noise"

@@ -126,18 +126,18 @@ def test_the_report_and_the_monitor_warn_in_words(tmp_path: Path) -> None:
     simulate_ideal(config, "own", tmp_path / "run.mcap", lambda _: None)
     recording = read_recording(tmp_path / "run.mcap")
     summary = summarise(recording, config.parameters)
-    (warning,) = summary["warnings"]
-    assert warning["kind"] == "law_range"
+    (warning,) = summary.warnings
+    assert warning.kind == "law_range"
     page = render_report(build_report_data(recording, summary), [])
     section = page[page.index('id="monitoring"') : page.index("Timing, dropouts")]
     assert "law range" in section
-    assert escape(warning["text"]) in section
+    assert escape(warning.text) in section
     assert "law_range" not in page
     state = LiveRunState()
     for item in recording.items:
         state = update_run_state(state, recording.start.run, item)
     (line,) = (line for line in state.events.values() if "own_cubic" in line.text)
-    assert (line.level, line.text) == ("WARN", f"law range: {warning['text']}")
+    assert (line.level, line.text) == ("WARN", f"law range: {warning.text}")
 
 
 def test_a_batch_warns_once_of_each_model_and_keeps_every_case(
@@ -157,7 +157,7 @@ def test_a_batch_warns_once_of_each_model_and_keeps_every_case(
 @pytest.mark.parametrize(("end_m", "count"), [(1e-3, 1), (0.1, 0)])
 def test_a_history_of_a_campaign_warns_once(tmp_path: Path, end_m: float, count: int) -> None:
     config = read_run_config(write_profile(tmp_path, CHIRP, end_m))
-    warnings = simulate_peaks(config)["warnings"]
+    _, warnings = simulate_peaks(config)
     assert [text.startswith(SENTENCE) for text in warnings] == [True] * count
 
 

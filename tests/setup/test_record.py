@@ -71,7 +71,7 @@ def write_profile(folder: Path, more: str = "", rig: str = "") -> Path:
 
 def play_run(
     folder: Path, more: str = "", rig: str = "", stop_at: int | None = None
-) -> tuple[RunConfig, Recording, dict[str, Any]]:
+) -> tuple[RunConfig, Recording, Any]:
     config = read_run_config(write_profile(folder, more, rig))
     latest = [0]
 
@@ -87,12 +87,12 @@ def play_run(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, Any]:
     """With its loop check, on a sound table whose specimen is the model."""
     return play_run(tmp_path_factory.mktemp("record"))
 
 
-Run = tuple[RunConfig, Recording, dict[str, Any]]
+Run = tuple[RunConfig, Recording, Any]
 
 
 def measured(recording: Recording) -> Block:
@@ -101,12 +101,12 @@ def measured(recording: Recording) -> Block:
 
 def test_the_table_follows_the_record_after_a_loop_check(run: Run) -> None:
     config, recording, summary = run
-    assert (summary["verdict"], summary["gaps"], summary["trips"]) == ("complete", 0, [])
+    assert (summary.verdict, summary.gaps, summary.trips) == ("complete", 0, [])
     checks = recording.records(Check)
     assert len(checks) > 20
     assert all(check.passed for check in checks)
     block = measured(recording)
-    block = block.cut(round(summary["windows"][0]["from_s"] * block.rate_hz), block.end)
+    block = block.cut(round(summary.windows[0].from_s * block.rate_hz), block.end)
     command = config.drive.command(config.drive.segments[-1].start, len(block))
     assert np.abs(block.channel("drive_disp_m") - command).max() < 2e-6
     lag = round(0.02 * block.rate_hz)
@@ -120,41 +120,44 @@ def test_record_has_no_results_of_a_stepped_sine(run: Run) -> None:
     assert recording.start.steps == ()
     assert not recording.records(Level)
     assert not recording.records(PrcPoint)
-    assert summary["steps"] == summary["jumps"] == summary["hysteresis"] == []
-    assert summary["u_star_m"] is None
+    assert summary.steps == summary.jumps == summary.hysteresis == []
+    assert summary.u_star_m is None
     assert (measured(recording).cycle == -1).all()
 
 
 def test_the_results_are_given_by_windows(run: Run) -> None:
     _, recording, summary = run
-    windows, block = summary["windows"], measured(recording)
-    assert [window["index"] for window in windows] == [0, 1, 2, 3]
-    assert all(before["to_s"] == after["from_s"] for before, after in pairwise(windows))
+    windows, block = summary.windows, measured(recording)
+    assert [window.index for window in windows] == [0, 1, 2, 3]
+    assert all(before.to_s == after.from_s for before, after in pairwise(windows))
     for window in windows:
-        inside = (block.time_s >= window["from_s"]) & (block.time_s < window["to_s"])
+        inside = (block.time_s >= window.from_s) & (block.time_s < window.to_s)
         assert set(block.label[inside].tolist()) == {Label.MEASURE}
-        assert set(block.step[inside].tolist()) == {window["index"]}
+        assert set(block.step[inside].tolist()) == {window.index}
         u = (block.channel("mass_disp_m") - block.channel("table_disp_m"))[inside]
-        assert window["measured"]["u"]["peak"] == pytest.approx(np.abs(u).max())
-        assert window["measured"]["u"]["rms"] == pytest.approx(np.sqrt(np.mean(u**2)))
+        assert window.measured.u.peak == pytest.approx(np.abs(u).max())
+        assert window.measured.u.rms == pytest.approx(np.sqrt(np.mean(u**2)))
         table = block.channel("table_acc_m_s2")[inside]
-        assert window["table_acc"]["peak"] == pytest.approx(np.abs(table).max())
+        assert window.table_acc.peak == pytest.approx(np.abs(table).max())
 
 
 def test_the_twin_agrees_where_the_model_is_the_specimen(run: Run) -> None:
     _, _, summary = run
-    assert summary["comparison"]["rel_disp_m"]["nrmse"] < 0.01
-    assert summary["comparison"]["rel_disp_m"]["free_nrmse"] < 0.02
+    assert summary.comparison["rel_disp_m"].nrmse < 0.01
+    assert summary.comparison["rel_disp_m"].free_nrmse < 0.02
     impacts = 0
-    for window in summary["windows"][1:3]:
-        assert window["comparison"]["rel_disp_m"]["nrmse"] < 0.01
+    for window in summary.windows[1:3]:
+        assert window.comparison["rel_disp_m"].nrmse < 0.01
         for name in ("u", "a", "force_r", "force_l"):
             for key in ("peak", "rms"):
-                expected = window["measured"][name][key]
-                assert window["twin"][name][key] == pytest.approx(expected, rel=0.02)
+                expected, twin = (
+                    getattr(getattr(motion, name), key) for motion in (window.measured, window.twin)
+                )
+                assert twin == pytest.approx(expected, rel=0.02)
         for side in ("impacts_right", "impacts_left"):
-            assert abs(window["measured"][side] - window["twin"][side]) <= 1
-            impacts += window["measured"][side]
+            impacts_measured = getattr(window.measured, side)
+            assert abs(impacts_measured - getattr(window.twin, side)) <= 1
+            impacts += impacts_measured
     assert impacts > 10
 
 
@@ -166,8 +169,8 @@ def test_another_model_disagrees(run: Run, tmp_path: Path) -> None:
     config = from_texts("x", start.profile_toml, start.rig_toml, stiffer, "recording")
     path = tmp_path / "run.mcap"
     replay_recording(recorded_in(recording), config, path, "again", lambda _: None)
-    summary = summarise(read_recording(path), config.parameters)
-    assert summary["comparison"]["rel_disp_m"]["free_nrmse"] > 0.05
+    summary: Any = summarise(read_recording(path), config.parameters)
+    assert summary.comparison["rel_disp_m"].free_nrmse > 0.05
 
 
 def test_a_replay_needs_the_recording_alone_and_is_identical(run: Run, tmp_path: Path) -> None:
@@ -181,7 +184,7 @@ def test_a_replay_needs_the_recording_alone_and_is_identical(run: Run, tmp_path:
     identity = replay_recording(recorded_in(recording), again, path, "again", lambda _: None)
     assert identity.is_identical
     assert identity.compared == identity.recorded > 1000
-    assert summarise(read_recording(path), again.parameters)["windows"] == summary["windows"]
+    assert summarise(read_recording(path), again.parameters).windows == summary.windows
 
 
 @pytest.mark.parametrize(
@@ -204,20 +207,20 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
     rig = f"{RIG}\n[[simulated.faults]]\nat_s = {at_s}\n{fault}\n"
     config, recording, summary = play_run(tmp_path, NO_CHECK, rig)
     (trip,) = recording.records(Trip)
-    assert summary["verdict"] == "aborted"
+    assert summary.verdict == "aborted"
     assert trip.kind in kinds
     assert at_s <= trip.index / config.drive.rate_hz < at_s + 1.0
     stop = recording.stop
     assert stop is not None
     assert stop.states[-1] == "at rest"
     assert stop.index < config.drive.planned_end  # the record was not played to its end
-    assert 1 <= len(summary["windows"]) < 4
+    assert 1 <= len(summary.windows) < 4
 
 
 @pytest.mark.parametrize("stop_s", [1.0, 3.0, 4.56, 8.0])
 def test_a_stop_in_motion_comes_to_rest_smoothly(stop_s: float, tmp_path: Path) -> None:
     config, recording, summary = play_run(tmp_path, NO_CHECK, stop_at=round(stop_s * 2000))
-    assert summary["verdict"] == "stopped"
+    assert summary.verdict == "stopped"
     block = measured(recording)
     command = block.channel("drive_disp_m")
     assert np.abs(command[-500:]).max() < 1e-6
@@ -256,7 +259,7 @@ def test_blocks_of_another_length_give_the_same_record(tmp_path: Path) -> None:
         folder.mkdir()
         more = f"{NO_CHECK}[acquisition]\nblock_samples = {samples}\n"
         _, recording, summary = play_run(folder, more)
-        assert summary["verdict"] == "complete"
+        assert summary.verdict == "complete"
         commands.append(measured(recording).values)
     size = min(values.shape[1] for values in commands)
     assert commands[0][:, :size].tobytes() == commands[1][:, :size].tobytes()
@@ -301,9 +304,9 @@ def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Pa
     config = from_texts(
         "x", back.start.profile_toml, back.start.rig_toml, back.start.model_toml, "x"
     )
-    windows = summarise(back, config.parameters)["windows"]
-    assert [window["measured"] for window in windows] == [
-        window["measured"] for window in summary["windows"]
+    windows: Any = summarise(back, config.parameters).windows
+    assert [window.measured for window in windows] == [
+        window.measured for window in summary.windows
     ]
 
 

@@ -22,6 +22,7 @@ from table_io.records import (
 )
 from twin.compare.twins import HISTORY_S
 from twin.recording.reader import Recording, read_recording
+from twin.results.contracts import HysteresisInterval, Jump
 from twin.results.summary import summarise
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.unpaced import play_unpaced
@@ -69,29 +70,25 @@ def play_run(
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, Any]:
     bundle, log = play_run(tmp_path_factory.mktemp("unpaced"))
     recording = read_recording(log)
     return bundle, recording, summarise(recording, bundle.parameters)
 
 
-def amplitude_mm(summary: dict[str, Any], direction: str, hz: float, source: str) -> float:
+def amplitude_mm(summary: Any, direction: str, hz: float, source: str) -> float:
     (step,) = [
-        step
-        for step in summary["steps"]
-        if (step["direction"], step["frequency_hz"]) == (direction, hz)
+        step for step in summary.steps if (step.direction, step.frequency_hz) == (direction, hz)
     ]
-    return 1e3 * summary["u_star_m"] * step[source]["eta_d"]
+    return 1e3 * summary.u_star_m * getattr(step, source).eta_d
 
 
-def level(summary: dict[str, Any], direction: str, hz: float) -> float:
+def level(summary: Any, direction: str, hz: float) -> float:
     """Fundamental of the table over the 0.05 g that was asked for."""
     (step,) = [
-        step
-        for step in summary["steps"]
-        if (step["direction"], step["frequency_hz"]) == (direction, hz)
+        step for step in summary.steps if (step.direction, step.frequency_hz) == (direction, hz)
     ]
-    return step["table_acc_fundamental_m_s2"] / LEVEL
+    return step.table_acc_fundamental_m_s2 / LEVEL
 
 
 def test_every_measured_sample_is_in_the_log_once(run: tuple) -> None:
@@ -137,15 +134,13 @@ def test_log_holds_inputs_and_records_of_the_run(run: tuple) -> None:
 def test_right_hysteresis_where_the_model_has_it(run: tuple, prefix: str) -> None:
     """Fold 4.027 Hz, passed late in a sweep (4.1 to 4.3 Hz); up-jump 2.787 Hz: on a 0.2 Hz grid."""
     _, _, summary = run
-    (interval,) = summary[f"{prefix}hysteresis"]
-    assert interval == {"kind": "right", "from_hz": 2.8, "to_hz": interval["to_hz"]}
-    assert interval["to_hz"] in {4.0, 4.2}
-    down, up = summary[f"{prefix}jumps"]
-    after = GRID[GRID.index(interval["to_hz"]) + 1]
-    assert down == {
-        "direction": "forward", "from_hz": interval["to_hz"], "to_hz": after, "kind": "down",
-    }  # fmt: skip
-    assert up == {"direction": "backward", "from_hz": 2.8, "to_hz": 2.6, "kind": "up"}
+    (interval,) = getattr(summary, f"{prefix}hysteresis")
+    assert interval == HysteresisInterval(kind="right", from_hz=2.8, to_hz=interval.to_hz)
+    assert interval.to_hz in {4.0, 4.2}
+    down, up = getattr(summary, f"{prefix}jumps")
+    after = GRID[GRID.index(interval.to_hz) + 1]
+    assert down == Jump(direction="forward", from_hz=interval.to_hz, to_hz=after, kind="down")
+    assert up == Jump(direction="backward", from_hz=2.8, to_hz=2.6, kind="up")
 
 
 def test_two_solutions_at_3_4_hz(run: tuple) -> None:
@@ -161,24 +156,22 @@ def test_two_solutions_at_3_4_hz(run: tuple) -> None:
         assert amplitude_mm(summary, "forward", 3.4, source) == pytest.approx(5.123, rel=0.01)
         flight = 1.247 * level(summary, "backward", 3.4)
         assert amplitude_mm(summary, "backward", 3.4, source) == pytest.approx(flight, rel=0.01)
-    forward, backward = (
-        [s for s in summary["steps"] if s["frequency_hz"] == 3.4][k] for k in (0, 1)
-    )
+    forward, backward = ([s for s in summary.steps if s.frequency_hz == 3.4][k] for k in (0, 1))
     for source in ("measured", "twin"):
-        assert forward[source]["impacts_right"] == (1, 1)
-        assert forward[source]["impacts_left"] == (1, 1)
-        assert backward[source]["impacts_right"] == (0, 0)
-        assert backward[source]["r_r"] == backward[source]["eta_l"] == 0
+        impacting, flying = getattr(forward, source), getattr(backward, source)
+        assert impacting.impacts_right == impacting.impacts_left == [1, 1]
+        assert flying.impacts_right == [0, 0]
+        assert flying.r_r == flying.eta_l == 0
 
 
 def test_the_twin_is_the_plant_within_its_noise(run: tuple) -> None:
     """Two formulations and two integrators of one physics; the rest is sensor noise."""
     _, recording, summary = run
-    comparison = summary["comparison"]
-    assert comparison["rel_disp_m"]["nrmse"] < 0.01
+    comparison = summary.comparison
+    assert comparison["rel_disp_m"].nrmse < 0.01
     for name, values in comparison.items():
-        assert values["nrmse"] < 0.02, name
-        assert values["free_nrmse"] < 0.02, name
+        assert values.nrmse < 0.02, name
+        assert values.free_nrmse < 0.02, name
     predicted, block = (
         recording.contiguous_blocks("pred")[0],
         recording.contiguous_blocks("meas")[0],
@@ -190,12 +183,12 @@ def test_the_twin_is_the_plant_within_its_noise(run: tuple) -> None:
 
 def test_quantities_of_rig_and_twin_agree_step_by_step(run: tuple) -> None:
     _, _, summary = run
-    for step in summary["steps"]:
+    for step in summary.steps:
         for name in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
-            want = pytest.approx(step["measured"][name], rel=0.02, abs=2e-3)
-            assert step["twin"][name] == want, (step["index"], name)
-        assert step["twin"]["impacts_right"] == step["measured"]["impacts_right"]
-        assert step["twin"]["impacts_left"] == step["measured"]["impacts_left"]
+            want = pytest.approx(getattr(step.measured, name), rel=0.02, abs=2e-3)
+            assert getattr(step.twin, name) == want, (step.index, name)
+        assert step.twin.impacts_right == step.measured.impacts_right
+        assert step.twin.impacts_left == step.measured.impacts_left
 
 
 def test_the_first_prediction_is_at_the_first_restart(run: tuple) -> None:
@@ -224,13 +217,13 @@ def test_the_run_is_the_same_to_the_bit_every_time(tmp_path: Path) -> None:
 def test_a_stop_ends_at_rest_with_what_was_measured(tmp_path: Path) -> None:
     bundle, log = play_run(tmp_path, stop_at=9000)
     recording = read_recording(log)
-    summary = summarise(recording, bundle.parameters)
-    assert summary["verdict"] == "stopped"
+    summary: Any = summarise(recording, bundle.parameters)
+    assert summary.verdict == "stopped"
     assert recording.missing_samples == 0
     whole = recording.contiguous_blocks("meas")[0]
     assert (whole.label == Label.STOP).any()
     assert abs(whole.channel("drive_disp_m")[-1000:]).max() < 1e-9
-    assert [step["frequency_hz"] for step in summary["steps"]] == [2.6]
+    assert [step.frequency_hz for step in summary.steps] == [2.6]
     for cycle in recording.records(CycleExtremes):
         assert not (whole.label[cycle.index - cycle.count : cycle.index] == Label.STOP).any()
 
@@ -240,14 +233,14 @@ def test_with_loop_check_and_control_every_step_has_its_level(tmp_path: Path) ->
     short = QUICK.replace("enabled = false", "enabled = true").replace("= 4.4", "= 3.0")
     bundle, log = play_run(tmp_path, short)
     recording = read_recording(log)
-    summary = summarise(recording, bundle.parameters)
-    assert summary["verdict"] == "complete"
-    assert summary["checks"]
-    assert all(check["passed"] for check in summary["checks"])
-    assert len(summary["steps"]) == 6
-    for step in summary["steps"]:
-        assert step["table_acc_fundamental_m_s2"] == pytest.approx(LEVEL, rel=0.02)
-        assert step["level"]["updates"] <= 3
+    summary: Any = summarise(recording, bundle.parameters)
+    assert summary.verdict == "complete"
+    assert summary.checks
+    assert all(check.passed for check in summary.checks)
+    assert len(summary.steps) == 6
+    for step in summary.steps:
+        assert step.table_acc_fundamental_m_s2 == pytest.approx(LEVEL, rel=0.02)
+        assert step.level.updates <= 3
     label = recording.contiguous_blocks("meas")[0].label
     checked = np.flatnonzero(label == Label.CHECK)
     assert checked.size
@@ -258,12 +251,12 @@ def test_free_flight_has_no_bumpers_anywhere(tmp_path: Path) -> None:
     bundle, log = play_run(tmp_path, QUICK.replace("= 4.0", "= inf").replace("2.6", "4.2"))
     summary = summarise(read_recording(log), bundle.parameters)
     assert math.isinf(bundle.parameters.gap_r)
-    for step in summary["steps"]:
+    for step in summary.steps:
         for source in ("measured", "twin"):
-            values = step[source]
-            assert (values["eta_r"], values["eta_l"], values["r_r"], values["r_l"]) == (0, 0, 0, 0)
-            assert values["impacts_right"] == values["impacts_left"] == (0, 0)
-    assert summary["hysteresis"] == []
+            values = getattr(step, source)
+            assert (values.eta_r, values.eta_l, values.r_r, values.r_l) == (0, 0, 0, 0)
+            assert values.impacts_right == values.impacts_left == [0, 0]
+    assert summary.hysteresis == []
 
 
 def test_a_table_that_is_not_simulated_cannot_be_unpaced(tmp_path: Path) -> None:

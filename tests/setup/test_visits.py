@@ -40,7 +40,7 @@ rate_hz = 1000.0
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, dict[str, Any]]:
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording, Any]:
     texts = [
         (PROFILES_DIR / name).read_text() for name in ("rigs/simulated.toml", "models/snm.toml")
     ]
@@ -53,14 +53,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording,
 
 def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
     bundle, recording, summary = run
-    assert [step["index"] for step in summary["steps"]] == [0, 1]
-    assert [visit["index"] for visit in summary["visits"]] == [2, 3]
-    for visit, decided in zip(summary["visits"], recording.records(StepAdded), strict=True):
-        assert (visit["frequency_hz"], visit["direction"]) == (4.0, "forward")
-        assert visit["reason"] == decided.reason
-        assert visit["measured"]["eta_d"] == pytest.approx(visit["twin"]["eta_d"], rel=0.03)
+    assert [step.index for step in summary.steps] == [0, 1]
+    assert [visit.index for visit in summary.visits] == [2, 3]
+    for visit, decided in zip(summary.visits, recording.records(StepAdded), strict=True):
+        assert (visit.frequency_hz, visit.direction) == (4.0, "forward")
+        assert visit.reason == decided.reason
+        assert visit.measured.eta_d == pytest.approx(visit.twin.eta_d, rel=0.03)
     (detected,) = [event.text for event in recording.records(Event) if event.kind == "found"]
-    assert summary["found"] == [detected]
+    assert summary.findings == [detected]
     assert "6 cycles held in 2 visits" in format_summary(summary, 2)
     shown = build_report_data(recording, summary)
     assert extract_prc(shown.points, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
@@ -85,7 +85,7 @@ def test_replay_of_visits_is_identical(run: tuple, tmp_path: Path) -> None:
             encode_item(record, "") for record in recording.records(kind)
         ]
     assert len(again.records(PrcPoint)) == 4
-    assert summarise(again, bundle.parameters)["visits"] == summary["visits"]
+    assert summarise(again, bundle.parameters).visits == summary.visits
 
 
 def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) -> None:
@@ -96,7 +96,7 @@ def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) ->
     rebuilt = summarise(
         replace(recording, items=StoredItems.from_items([*kept, fault])), bundle.parameters
     )
-    assert [visit["measured"] for visit in rebuilt["visits"]] == [
-        visit["measured"] for visit in summary["visits"]
+    assert [visit.measured for visit in rebuilt.visits] == [
+        visit.measured for visit in summary.visits
     ]
-    assert {visit["twin"] for visit in rebuilt["visits"]} == {None}
+    assert {visit.twin for visit in rebuilt.visits} == {None}

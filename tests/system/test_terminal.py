@@ -18,6 +18,7 @@ from table_io.records import Event, Fault, NormalizedResponse, PrcPoint, SampleG
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary
 from twin.report.prc_table import print_prc
+from twin.results.contracts import RunSummary
 from twin.setup import folders, warm_up
 from twin.setup.folders import make_output_folder, make_run_folder
 from twin.setup.run_config import read_run_config
@@ -28,7 +29,7 @@ from twin.system.progress import GAP_SERIES_SAMPLES, RunProgress
 def print_lines(width: int) -> list[str]:
     """The PRC of the summary at hand, as lines of a terminal of this width."""
     out = io.StringIO()
-    print_prc(Console(file=out, width=width), summary())
+    print_prc(Console(file=out, width=width), RunSummary.model_validate(summary()))
     return out.getvalue().splitlines()
 
 

@@ -23,7 +23,7 @@ from twin.drawing.branch_figures import (
 from twin.drawing.page import embed_images, render_page
 from twin.dynamics.continuation import Branch, BranchEnd
 from twin.dynamics.orbits import Orbit
-from twin.results.summary import Json, write_json
+from twin.results.contract import Json, write_json
 
 PORTRAIT_SAMPLES = 96  # per period, of the motion that the page shows
 MAX_PORTRAIT_SAMPLES = 384

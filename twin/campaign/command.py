@@ -12,11 +12,11 @@ from table_io.clock import local_datetime
 from table_io.config.calibration import find_overdue_calibrations
 from table_io.errors import InputError
 from twin.campaign.config import list_campaign_warnings, read_plan
-from twin.campaign.merge import read_summary
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.offline import play_offline
 from twin.campaign.realtime import play_realtime
 from twin.campaign.report import write_campaign_report
+from twin.campaign.result import CampaignSummary
 from twin.campaign.state import (
     LOCK_FILE,
     ActiveCampaign,
@@ -147,9 +147,9 @@ def _print_outcome(
 ) -> int:
     """Print the outcome and the command that resumes the campaign; return the exit code."""
     pending, runs = campaign.pending_runs(), campaign.state.runs
-    comparison = read_summary(campaign.folder).get("gap_comparison")
-    if comparison is not None:
-        print_gap_comparison(comparison)
+    summary = CampaignSummary.read(campaign.folder / "summary.json", "resume the campaign")
+    if summary.gap_comparison is not None:
+        print_gap_comparison(summary.gap_comparison)
     print_line(f"{len(runs) - len(pending)} of {len(runs)} runs complete -> {page}")
     if pending:
         print_line(f"remaining: {', '.join(run.label for run in pending)}; continue with")

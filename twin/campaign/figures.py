@@ -54,7 +54,7 @@ def _draw_each(campaign: CampaignData) -> CaptionedFigures:
     drawn = [draw_all_gaps(cases, measured_campaign)]
     if sum(name in cases for name in TRANSITION_COLOURS) > 1:
         drawn.append(draw_transition(cases, measured_campaign))
-    normalization = describe_normalization(campaign.stars)
+    normalization = describe_normalization(campaign.free_flight)
     for drawing in drawn:
         caption = f"{drawing.caption} {normalization[0].upper()}{normalization[1:]}."
         yield replace(drawing, name=drawing.name.removeprefix("rig_"), caption=caption)
@@ -89,12 +89,12 @@ def _is_covered_finer(point: PrcPoint, of: Sweep, sweeps: list[Sweep]) -> bool:
 
 def list_swept_runs(campaign: CampaignData) -> list[CampaignRunData]:
     """List the runs of a stepped sine of which a step was measured: only they are drawn."""
-    return [run for run in campaign.runs if run.profile.steps and run.summary["steps"]]
+    return [run for run in campaign.runs if run.profile.steps and run.summary.steps]
 
 
 def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], MeasuredCampaign]:
     """Return the model's curves and the measured points by gap, the largest gap first."""
-    stars = (campaign.stars["u_star_m"], campaign.stars["a_star_m_s2"]) if campaign.stars else None
+    stars = campaign.free_flight.stars if campaign.free_flight else None
     by_gap: dict[float, list[CampaignRunData]] = {}
     for run in list_swept_runs(campaign):
         by_gap.setdefault(run.profile.specimen.gap_mm, []).append(run)
@@ -115,7 +115,7 @@ def prc_families(campaign: CampaignData) -> tuple[dict[str, PaperCase], Measured
         measured_campaign.points[name] = [
             point
             for run in runs
-            for point in prc_points(run.summary["steps"])
+            for point in prc_points(run.summary.steps)
             if not _is_covered_finer(point, run.profile.sweep, sweeps)
         ]
     return cases, measured_campaign
@@ -128,9 +128,9 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     band = 100 * max(run.profile.control.tolerance for run in campaign.runs)
     ax.axhspan(-band, band, color="#1a7f37", alpha=0.10, lw=0)
     errors = [
-        (step["direction"], step["frequency_hz"], 100 * error)
+        (step.direction, step.frequency_hz, 100 * error)
         for run in list_swept_runs(campaign)
-        for error, step in list_level_errors(run.summary["steps"])
+        for error, step in list_level_errors(run.summary.steps)
     ]
     for direction in DIRECTIONS:
         own = [place for name, *place in errors if name == direction]

@@ -13,18 +13,25 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from table_io.block import Float2D
+from table_io.block import Float1D, Float2D
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
-from twin.campaign.merge import SOURCES
+from twin.campaign.result import (
+    BestGap,
+    GapResult,
+    GapSpread,
+    PeakSource,
+    RecordResponse,
+    Spread,
+)
+from twin.results.contracts import MotionResult, RunSummary
 from twin.results.paper_cases import name_gap
 
-Json = dict[str, Any]
+SOURCES: tuple[PeakSource, ...] = ("measured", "twin")
 PEAKS = ("u_m", "a_m_s2", "force_n")
 ETA_A, ETA_D, COMPROMISE, FORCE_RATIO = "eta_a", "eta_d", "compromise", "r"
 CRITERIA = {
@@ -47,13 +54,12 @@ class RecordRun:
     gap_mm: float
     mass_kg: float
     label: str
-    summary: Json
+    summary: RunSummary
 
     @property
     def has_dropouts(self) -> bool:
         """Whether samples are missing in its last recording, which holds the whole record."""
-        parts = self.summary.get("parts")
-        return bool(parts[-1]["gaps"] if parts else self.summary.get("gaps"))
+        return self.summary.has_dropouts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,11 +75,11 @@ class GapComparison:
     records: tuple[str, ...]
     gaps_mm: tuple[float, ...]
     values: Mapping[tuple[str, str], Float2D]
-    sources: tuple[str, ...] = SOURCES
+    sources: tuple[PeakSource, ...] = SOURCES
     left_out: tuple[str, ...] = ()
 
     @property
-    def main_source(self) -> str:
+    def main_source(self) -> PeakSource:
         """Source by which the gaps are judged first."""
         return self.sources[0]
 
@@ -101,16 +107,16 @@ def format_gap(gap_mm: float) -> str:
 
 
 def list_record_runs(
-    runs: Sequence[tuple[str, Profile, Json]], names: Mapping[str, str]
+    runs: Sequence[tuple[str, Profile, RunSummary]], names: Mapping[str, str]
 ) -> list[RecordRun]:
     """Return the complete runs of records of (label, profile, summary).
 
     `names` are those of the records by the label of a run; else the name of the file counts.
     Different motions of one name have the scale added, and the label of a run if that is equal too.
     """
-    listed: dict[str, list[tuple[str, Profile, Json]]] = {}
+    listed: dict[str, list[tuple[str, Profile, RunSummary]]] = {}
     for label, profile, summary in runs:
-        if isinstance(profile.excitation, RecordedHistory) and summary["verdict"] == "complete":
+        if isinstance(profile.excitation, RecordedHistory) and summary.verdict == "complete":
             listed.setdefault(_identify(profile.excitation), []).append((label, profile, summary))
     record_names = _name_records(listed, names)
     return [
@@ -134,7 +140,7 @@ def _identify(excitation: RecordedHistory) -> str:
 
 
 def _name_records(
-    listed: Mapping[str, list[tuple[str, Profile, Json]]], names: Mapping[str, str]
+    listed: Mapping[str, list[tuple[str, Profile, RunSummary]]], names: Mapping[str, str]
 ) -> dict[str, str]:
     """Return a different name for each motion, by its key, of the runs that play it."""
     record_names, scales, labels = {}, {}, {}
@@ -155,7 +161,7 @@ def _name_records(
 
 
 def compare_gaps(
-    runs: Sequence[RecordRun], sources: tuple[str, ...] = SOURCES
+    runs: Sequence[RecordRun], sources: tuple[PeakSource, ...] = SOURCES
 ) -> GapComparison | None:
     """Return the comparison; None unless a record was played at two gaps, one the reference.
 
@@ -192,15 +198,19 @@ def compare_gaps(
     return GapComparison(tuple(records.values()), gaps_mm, values, sources, left_out)
 
 
-def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float, float]:
+def find_record_peaks(run: RecordRun, source: PeakSource) -> tuple[float, float, float, float]:
     """Return the peaks (u in m, a in m/s2, force in N, force over weight) of a run over its record.
 
     NaN for what is missing, and for the force without bumpers.
     """
-    windows = [window.get(source) or {} for window in run.summary.get("windows") or ()]
+    windows = run.summary.windows or []
+    motions = [
+        (window.measured if source == "measured" else window.twin) or MotionResult()
+        for window in windows
+    ]
 
     def find_largest(*names: str) -> float:
-        peaks = [(window.get(name) or {}).get("peak") for window in windows for name in names]
+        peaks = [getattr(motion, name).peak for motion in motions for name in names]
         known = [peak for peak in peaks if peak is not None]
         return float(max(known)) if known and len(known) == len(peaks) else math.nan
 
@@ -209,11 +219,9 @@ def find_record_peaks(run: RecordRun, source: str) -> tuple[float, float, float,
     return find_largest("u"), find_largest("a"), force, force / weight
 
 
-def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | None:
+def rank_gaps(comparison: GapComparison, source: PeakSource, criterion: str) -> BestGap | None:
     """Return the best gap by the median over the records, and how clear it is.
 
-    `best_in` counts the records in which it is the best, `margin` is by how much the median of the
-    next gap is larger. If the best gap is the smallest one tested, a smaller one may be better.
     Gaps at which a record is missing are left out; None with fewer than two.
     """
     table = comparison.values[source, criterion]
@@ -224,86 +232,88 @@ def rank_gaps(comparison: GapComparison, source: str, criterion: str) -> Json | 
     medians = np.median(ranked, axis=0)
     best, following = np.argsort(medians, kind="stable")[:2]
     best_in = int(np.count_nonzero(np.argmin(ranked, axis=1) == best))
-    return {
-        "gap_mm": comparison.gaps_mm[complete[best]],
-        "is_smallest_gap": bool(complete[best] == len(comparison.gaps_mm) - 1),
-        "median": float(medians[best]),
-        "smallest": float(ranked[:, best].min()),
-        "largest": float(ranked[:, best].max()),
-        "best_in": best_in,
-        "of": len(comparison.records),
-        "next_gap_mm": comparison.gaps_mm[complete[following]],
-        "next_median": float(medians[following]),
-        "margin": float(medians[following] / medians[best] - 1.0) if medians[best] > 0 else None,
-        "compared_gaps_mm": [comparison.gaps_mm[column] for column in complete],
-    }
+    return BestGap(
+        gap_mm=comparison.gaps_mm[complete[best]],
+        is_smallest_gap=bool(complete[best] == len(comparison.gaps_mm) - 1),
+        median=float(medians[best]),
+        smallest=float(ranked[:, best].min()),
+        largest=float(ranked[:, best].max()),
+        best_in=best_in,
+        of=len(comparison.records),
+        next_gap_mm=comparison.gaps_mm[complete[following]],
+        next_median=float(medians[following]),
+        margin=float(medians[following] / medians[best] - 1.0) if medians[best] > 0 else None,
+        compared_gaps_mm=[comparison.gaps_mm[column] for column in complete],
+    )
 
 
-def describe_comparison(comparison: GapComparison) -> Json:
-    """Return the entry `gap_comparison` of a campaign's summary; gap_mm is null without bumpers."""
+def describe_comparison(comparison: GapComparison) -> GapResult:
+    """Return the comparison as it is printed, shown and written."""
     quantities = (*PEAKS, *CRITERIA)
-    return {
-        "reference_gap_mm": comparison.reference_mm,
-        "reference": comparison.reference,
-        "sources": list(comparison.sources),
-        "main_name": comparison.main_name,
-        "records": list(comparison.records),
-        "left_out": list(comparison.left_out),
-        "gaps_mm": list(comparison.gaps_mm),
-        "criteria": CRITERIA,
-        "best": {
+    return GapResult(
+        reference_gap_mm=comparison.reference_mm,
+        reference=comparison.reference,
+        sources=list(comparison.sources),
+        main_name=comparison.main_name,
+        records=list(comparison.records),
+        left_out=list(comparison.left_out),
+        gaps_mm=list(comparison.gaps_mm),
+        criteria=CRITERIA,
+        best={
             source: {name: rank_gaps(comparison, source, name) for name in CRITERIA}
             for source in comparison.sources
         },
-        "gaps": [
-            {"gap_mm": gap_mm}
-            | {
-                source: {
-                    name: _describe_spread(comparison.values[source, name][:, column])
-                    for name in CRITERIA
-                }
-                for source in comparison.sources
-            }
+        gaps=[
+            GapSpread(
+                gap_mm=gap_mm,
+                **{
+                    source: {
+                        name: _find_spread(comparison.values[source, name][:, column])
+                        for name in CRITERIA
+                    }
+                    for source in comparison.sources
+                },
+            )
             for column, gap_mm in enumerate(comparison.gaps_mm)
         ],
-        "responses": [
-            {"record": record, "gap_mm": gap_mm}
-            | {
-                source: {
-                    name: float(comparison.values[source, name][row, column]) for name in quantities
-                }
-                for source in comparison.sources
-            }
+        responses=[
+            RecordResponse(
+                record=record,
+                gap_mm=gap_mm,
+                **{
+                    source: {
+                        name: float(comparison.values[source, name][row, column])
+                        for name in quantities
+                    }
+                    for source in comparison.sources
+                },
+            )
             for column, gap_mm in enumerate(comparison.gaps_mm)
             for row, record in enumerate(comparison.records)
         ],
-    }
+    )
 
 
-def _describe_spread(values: Any) -> Json:
+def _find_spread(values: Float1D) -> Spread:
     """Return smallest, median and largest over the records of (record,), and their number."""
     known = values[np.isfinite(values)]
     if not known.size:
-        return {"smallest": None, "median": None, "largest": None, "count": 0}
-    return {
-        "smallest": float(known.min()),
-        "median": float(np.median(known)),
-        "largest": float(known.max()),
-        "count": int(known.size),
-    }
+        return Spread(smallest=None, median=None, largest=None, count=0)
+    return Spread(
+        smallest=float(known.min()),
+        median=float(np.median(known)),
+        largest=float(known.max()),
+        count=int(known.size),
+    )
 
 
-def format_best(best: Json | None) -> str:
-    """Format the best gap of a summary with how clear it is; `gap_mm` is null without bumpers."""
+def format_best(best: BestGap | None) -> str:
+    """Format the best gap with how clear it is."""
     if best is None:
         return "not ranked: fewer than two gaps with every record"
-    name, following = (
-        format_gap(math.inf if best[key] is None else best[key])
-        for key in ("gap_mm", "next_gap_mm")
-    )
-    edge = ", the smallest gap tested" if best["is_smallest_gap"] else ""
-    margin = "" if best["margin"] is None else f" (+{100 * best['margin']:.0f} %)"
+    edge = ", the smallest gap tested" if best.is_smallest_gap else ""
+    margin = "" if best.margin is None else f" (+{100 * best.margin:.0f} %)"
     return (
-        f"{name}{edge}: {best['median']:.2f}, best in {best['best_in']} of {best['of']} records; "
-        f"next {following}: {best['next_median']:.2f}{margin}"
+        f"{format_gap(best.gap_mm)}{edge}: {best.median:.2f}, best in {best.best_in} of {best.of} "
+        f"records; next {format_gap(best.next_gap_mm)}: {best.next_median:.2f}{margin}"
     )

@@ -1,7 +1,6 @@
 """Terminal messages of a campaign, and prompts for the operator."""
 
 import getpass
-import math
 from typing import Literal
 
 from rich.table import Table
@@ -9,9 +8,10 @@ from rich.table import Table
 from table_io.clock import local_datetime
 from twin.campaign.config import PlannedRun
 from twin.campaign.gap_comparison import CRITERIA, format_best, format_gap
-from twin.campaign.merge import merge_summaries, read_summary
-from twin.campaign.state import ActiveCampaign, OperatorAnswer
-from twin.results.summary import Json, format_summary
+from twin.campaign.merge import merge_summaries
+from twin.campaign.result import GapResult, Spread
+from twin.campaign.state import ActiveCampaign, OperatorAnswer, read_part_summaries
+from twin.results.summary import format_summary
 from twin.system.terminal import console, print_line, print_table
 
 Reply = Literal["done", "skipped", "unattended", "not asked"]
@@ -47,8 +47,8 @@ def make_answer(asked: str, reply: Reply) -> OperatorAnswer:
 
 def format_run_end(campaign: ActiveCampaign, run: PlannedRun) -> str:
     """Return one line with the results of a run, merged over its recordings."""
-    state, folder = campaign.run_state(run), campaign.folder
-    summaries = [read_summary(folder / part.folder) for part in state.parts]
+    state = campaign.run_state(run)
+    summaries = read_part_summaries(campaign.folder, state)
     merged = merge_summaries(state, run.bundle.profile, summaries)
     result = format_summary(merged, len(run.bundle.steps))
     text = f"{format_run_name(campaign, run)}: {result}"
@@ -91,36 +91,32 @@ def ask_operator(
                 return None
 
 
-def print_gap_comparison(comparison: Json) -> None:
-    """Print the entry `gap_comparison` of a summary: medians over the records, best gaps."""
-    count, source = len(comparison["records"]), comparison["sources"][0]
+def print_gap_comparison(comparison: GapResult) -> None:
+    """Print a comparison of gaps: medians over the records, best gaps."""
+    count, source = len(comparison.records), comparison.sources[0]
     title = (
-        f"median (smallest to largest) over {count} records, {comparison['main_name']}; "
-        f"1 is {comparison['reference']}, * is best"
+        f"median (smallest to largest) over {count} records, {comparison.main_name}; "
+        f"1 is {comparison.reference}, * is best"
     )
     headers = ("acceleration", "displacement", "compromise", "force / weight")
     table = Table("gap", *headers, title=title)
-    best = comparison["best"][source]
-    for row in comparison["gaps"]:
-        cells = [_format_spread(row[source][name], _is_best(best[name], row)) for name in CRITERIA]
-        table.add_row(_name_gap(row), *cells)
+    best = comparison.best[source]
+    for row in comparison.gaps:
+        cells = []
+        for name in CRITERIA:
+            winner = best[name]
+            is_best = winner is not None and winner.gap_mm == row.gap_mm
+            cells.append(_format_spread(row.select(source)[name], is_best))
+        table.add_row(format_gap(row.gap_mm), *cells)
     print_table(console, table)
     for name, meaning in CRITERIA.items():
         print_line(f"{meaning}: {format_best(best[name])}")
-    if comparison["left_out"]:
-        print_line(f"left out, for dropouts in the recording: {', '.join(comparison['left_out'])}")
+    if comparison.left_out:
+        print_line(f"left out, for dropouts in the recording: {', '.join(comparison.left_out)}")
 
 
-def _name_gap(row: Json) -> str:
-    return format_gap(math.inf if row["gap_mm"] is None else row["gap_mm"])
-
-
-def _is_best(best: Json | None, row: Json) -> bool:
-    return best is not None and bool(best["gap_mm"] == row["gap_mm"])
-
-
-def _format_spread(spread: Json, is_best: bool) -> str:
-    if not spread["count"]:
+def _format_spread(spread: Spread, is_best: bool) -> str:
+    if not spread.count:
         return "–"
-    text = f"{spread['median']:.2f} ({spread['smallest']:.2f} to {spread['largest']:.2f})"
+    text = f"{spread.median:.2f} ({spread.smallest:.2f} to {spread.largest:.2f})"
     return f"{text} *" if is_best else text

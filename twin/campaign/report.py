@@ -1,5 +1,6 @@
 """Write report.html, summary.json and figures/ of a campaign from the files in its folder."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -21,8 +22,7 @@ from twin.campaign.gap_comparison import (
 from twin.campaign.summary import CampaignData, read_campaign
 from twin.drawing.page import embed_images, format_significant, render_page
 from twin.drawing.plot_style import Picture
-from twin.results import summary as summaries
-from twin.results.summary import Json
+from twin.results.contracts import PeakAndRms, RunSummary
 
 SYMBOLS = {
     ETA_A: "η<sub>a</sub>",
@@ -38,7 +38,7 @@ FULL_RATIO = 4.0  # ratio to the reference, or its inverse, at which a colour is
 def write_campaign_report(folder: Path) -> Path:
     """Write summary.json, figures/ and report.html; return the path of report.html."""
     campaign = read_campaign(folder)
-    summaries.write_json(campaign.summary, folder / "summary.json")
+    campaign.summary.write(folder / "summary.json")
     pictures = draw_campaign_figures(campaign, folder / "figures")
     pairs = draw_gap_pairs(campaign.gaps, folder / "figures")
     path = folder / "report.html"
@@ -54,7 +54,7 @@ def render_campaign_report(
     `pairs` are the figures of the comparison of gaps, on a light and on a dark ground.
     """
     text = (campaign.folder / "campaign.toml").read_text(encoding="utf-8")
-    runs = list(zip(campaign.summary["runs"], campaign.runs, strict=True))
+    runs = list(zip(campaign.summary.runs, campaign.runs, strict=True))
     return render_page(
         Path(__file__).with_name("campaign.html"),
         summary=campaign.summary,
@@ -66,10 +66,12 @@ def render_campaign_report(
             for run, data in runs
             if not data.profile.steps
         ],
-        stars=campaign.stars,
+        stars=campaign.free_flight,
         has_sweeps=any(run.profile.steps for run in campaign.runs),
-        gaps=campaign.summary["gap_comparison"],
-        **list_gap_values(campaign.gaps),
+        gaps=campaign.summary.gap_comparison,
+        tables=list_gap_tables(campaign.gaps),
+        symbols=SYMBOLS,
+        gap_name=format_gap,
         pictures=embed_pairs(pairs),
         reports={path.parent.name for path in campaign.folder.glob("*/report.html")},
         images=embed_images(pictures),
@@ -78,47 +80,45 @@ def render_campaign_report(
     )
 
 
-def list_gap_values(comparison: GapComparison | None) -> Json:
-    """Return the values of the section "Records and gaps" of a page, by their names in it."""
-    return {
-        "tables": [] if comparison is None else list_gap_tables(comparison),
-        "source_name": "" if comparison is None else comparison.main_name,
-        "symbols": SYMBOLS,
-        "gap_name": format_gap,
-    }
-
-
 def embed_pairs(pairs: list[tuple[Picture, Picture]]) -> list[tuple[Any, Any, int]]:
     """Return ((picture, its PNG in base64), the same on a dark ground, number) of each pair."""
     embedded = [embed_images(pair) for pair in pairs]
     return [(light, dark, number) for number, (light, dark) in enumerate(embedded, 1)]
 
 
-def find_history_peaks(run: Json, gap_mm: float) -> Json:
-    """Return the measured peaks of a displacement history in display units; NaN if unknown.
+@dataclass(frozen=True, slots=True)
+class HistoryPeaks:
+    """Measured peaks of a displacement history in display units; NaN if unknown."""
 
-    The force without bumpers is noise, and NaN.
-    """
-    windows = run.get("windows") or []
-    measured = [window["measured"] for window in windows if window.get("measured")]
+    table_g: float
+    u_mm: float
+    a_g: float
+    force_kn: float
+    impacts: str  # right / left
 
-    def find_largest(entries: list[Json], *names: str) -> float:
-        peaks = [entry[name]["peak"] for entry in entries for name in names]
-        return max((peak for peak in peaks if peak is not None), default=np.nan)
 
-    counts = [
-        [entry[f"impacts_{side}"] for entry in measured if entry[f"impacts_{side}"] is not None]
-        for side in ("right", "left")
-    ]
-    return {
-        "table_g": find_largest(windows, "table_acc") / GRAVITY_M_S2,
-        "u_mm": 1e3 * find_largest(measured, "u"),
-        "a_g": find_largest(measured, "a") / GRAVITY_M_S2,
-        "force_kn": np.nan
-        if np.isinf(gap_mm)
-        else 1e-3 * find_largest(measured, "force_r", "force_l"),
-        "impacts": " / ".join(str(sum(side)) if side else "–" for side in counts),
-    }
+def find_history_peaks(run: RunSummary, gap_mm: float) -> HistoryPeaks:
+    """Return the measured peaks of a displacement history; the force without bumpers is noise."""
+    windows = run.windows or []
+    measured = [window.measured for window in windows if window.measured]
+
+    def find_largest(values: Iterable[PeakAndRms]) -> float:
+        return max((value.peak for value in values if value.peak is not None), default=np.nan)
+
+    def count(numbers: list[int | None]) -> str:
+        known = [number for number in numbers if number is not None]
+        return str(sum(known)) if known else "–"
+
+    forces = [force for motion in measured for force in (motion.force_r, motion.force_l)]
+    right = count([motion.impacts_right for motion in measured])
+    left = count([motion.impacts_left for motion in measured])
+    return HistoryPeaks(
+        table_g=find_largest(window.table_acc for window in windows) / GRAVITY_M_S2,
+        u_mm=1e3 * find_largest(motion.u for motion in measured),
+        a_g=find_largest(motion.a for motion in measured) / GRAVITY_M_S2,
+        force_kn=np.nan if np.isinf(gap_mm) else 1e-3 * find_largest(forces),
+        impacts=f"{right} / {left}",
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,8 +152,10 @@ class GapTable:
     rows: list[GapRow]
 
 
-def list_gap_tables(comparison: GapComparison) -> list[GapTable]:
+def list_gap_tables(comparison: GapComparison | None) -> list[GapTable]:
     """Return the tables of acceleration, displacement and force, with median and largest."""
+    if comparison is None:
+        return []
     peak_a = comparison.values[comparison.main_source, "a_m_s2"][:, 0] / GRAVITY_M_S2
     peak_u = comparison.values[comparison.main_source, "u_m"][:, 0] * 1e3
     where = comparison.reference

@@ -14,12 +14,18 @@ from table_io.errors import InputError
 from table_io.records import Event
 from twin.campaign.config import PlannedRun, read_plan
 from twin.campaign.figures import draw_gap_pairs
-from twin.campaign.gap_comparison import compare_gaps, describe_comparison, list_record_runs
+from twin.campaign.gap_comparison import (
+    compare_gaps,
+    describe_comparison,
+    format_gap,
+    list_record_runs,
+)
 from twin.campaign.messages import print_gap_comparison
-from twin.campaign.report import embed_pairs, list_gap_values
+from twin.campaign.report import SYMBOLS, embed_pairs, list_gap_tables
+from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.drawing.page import render_page
 from twin.model.valid_range import EVENT_KIND
-from twin.results.summary import Json, write_json
+from twin.results.contracts import MotionResult, PeakAndRms, RunInfo, RunSummary, WindowResult
 from twin.results.windows import extract_free_twin
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import RunConfig
@@ -49,33 +55,30 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         )
     compile_kernels(planned[0].bundle)
     folder, _ = make_run_folder(out, f"{plan.path.stem}-model")
-    runs = []
+    runs, warnings = [], []
     with show_status("simulating") as show_part:
         for run in planned:
             show_part(run.label)
-            runs.append((run.label, run.bundle.profile, simulate_peaks(run.bundle)))
+            peaks, range_exits = simulate_peaks(run.bundle)
+            runs.append((run.label, run.bundle.profile, peaks))
+            warnings += [f"{run.label}: {text}" for text in range_exits]
     comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
     assert comparison is not None
-    warnings = [
-        f"{label}: {text}"
-        for label, _, run_summary in runs
-        for text in run_summary.get("warnings", ())
-    ]
     pairs = draw_gap_pairs(comparison, folder / "figures")
     described = describe_comparison(comparison)
-    summary = {
-        "campaign": {
-            "title": plan.config.title,
-            "citation": plan.config.citation,
-            "notes": plan.config.notes,
-            "model": _name_models(planned),
-        },
-        "verdict": "complete",
-        "reason": f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
-        "gap_comparison": described,
-        "warnings": warnings,
-    }
-    write_json(summary, folder / "summary.json")
+    summary = CampaignSummary(
+        campaign=CampaignInfo(
+            title=plan.config.title,
+            citation=plan.config.citation,
+            notes=plan.config.notes,
+            model=_name_models(planned),
+        ),
+        verdict="complete",
+        reason=f"{len(comparison.records)} records at {len(comparison.gaps_mm)} gaps",
+        gap_comparison=described,
+        warnings=warnings,
+    )
+    summary.write(folder / "summary.json")
     page = render_page(
         Path(__file__).with_name("gap_page.html"),
         summary=summary,
@@ -83,20 +86,22 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         pictures=embed_pairs(pairs),
         text=plan.text,
         digest=sha256(plan.text.encode()).hexdigest(),
-        **list_gap_values(comparison),
+        tables=list_gap_tables(comparison),
+        symbols=SYMBOLS,
+        gap_name=format_gap,
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
     print_gap_comparison(described)
     for text in warnings:
         print_line(f"warning: {text}")
-    print_line(f"{summary['reason']}, model alone -> {folder / 'report.html'}")
+    print_line(f"{summary.reason}, model alone -> {folder / 'report.html'}")
     return 0
 
 
-def simulate_peaks(config: RunConfig) -> Json:
+def simulate_peaks(config: RunConfig) -> tuple[RunSummary, list[str]]:
     """Return a summary with the peaks of the model on an ideal table, over the whole history.
 
-    Its warnings say where a law leaves the range in which it was fitted.
+    And warnings where a law leaves the range in which it was fitted.
     """
     parts: dict[str, list[Float1D]] = {name: [] for name in ("u", "a", "force_r", "force_l")}
     warnings = []
@@ -114,16 +119,21 @@ def simulate_peaks(config: RunConfig) -> Json:
         for name, values in zip(parts, motion, strict=True):
             parts[name].append(values[playing])
     peaks = {name: float(np.abs(np.concatenate(blocks)).max()) for name, blocks in parts.items()}
-    return _describe_motion(**peaks) | {"warnings": warnings}
+    return _describe_motion(**peaks), warnings
 
 
 def _describe_motion(
     u: float, a: float = math.nan, force_r: float = math.nan, force_l: float = math.nan
-) -> Json:
+) -> RunSummary:
     """Return the summary of a history with one window, by peaks in SI."""
-    peaks = {"u": u, "a": a, "force_r": force_r, "force_l": force_l}
-    twin = {name: {"peak": peak} for name, peak in peaks.items()}
-    return {"verdict": "complete", "windows": [{"measured": None, "twin": twin}]}
+    twin = MotionResult(
+        u=PeakAndRms(peak=u),
+        a=PeakAndRms(peak=a),
+        force_r=PeakAndRms(peak=force_r),
+        force_l=PeakAndRms(peak=force_l),
+    )
+    window = WindowResult(index=0, from_s=0.0, to_s=math.nan, twin=twin)
+    return RunSummary(run=RunInfo(), verdict="complete", steps=[], windows=[window])
 
 
 def _name_models(runs: list[PlannedRun]) -> str:

@@ -1,7 +1,6 @@
 """State of a campaign: campaign.json, replaced atomically at every change, and its recordings."""
 
 import difflib
-import json
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,9 +24,9 @@ from twin.recording.merge import merge_run_parts
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.report.report import write_report
-from twin.results import summary as summaries
+from twin.results.contracts import RunSummary
 from twin.results.recordings import read_recorded_config
-from twin.results.summary import Json
+from twin.results.summary import summarise
 from twin.setup.folders import replace_text
 from twin.setup.run_config import RunConfig, make_run_id
 from twin.system.files import hash_file, lock_file
@@ -264,7 +263,9 @@ class ActiveCampaign:
     def finish_recording(self, run: PlannedRun) -> bool:
         """Update a run from the summary of its last recording; return whether it is complete."""
         state = self.run_state(run)
-        summary = json.loads((self.folder / state.parts[-1].folder / "summary.json").read_text())
+        summary = RunSummary.read(
+            self.folder / state.parts[-1].folder / "summary.json", "resume the campaign"
+        )
         parts = (*state.parts[:-1], with_summary(state.parts[-1], summary))
         all_measured = is_complete(state.model_copy(update={"parts": parts}), run.bundle.profile)
         self.update_run(state, parts=parts, status="complete" if all_measured else "interrupted")
@@ -340,25 +341,37 @@ def resume_campaign(folder: Path, plan: CampaignPlan) -> tuple[ActiveCampaign, l
     return campaign, warnings
 
 
-def write_summary_and_report(folder: Path) -> Json:
+def write_summary_and_report(folder: Path) -> RunSummary:
     """Write summary and report of a recording into the run's folder; return the summary."""
     recording = read_recording(folder / LOG_NAME)
-    summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
-    summary["sha256"] = hash_file(recording.path)
-    summaries.write_summary(summary, folder / "summary.json")
+    summary = summarise(recording, read_recorded_config(recording).parameters)
+    summary.sha256 = hash_file(recording.path)
+    summary.write(folder / "summary.json")
     write_report(folder, recording)
     return summary
 
 
-def with_summary(part: RunPart, summary: Json) -> RunPart:
+def read_part_summaries(folder: Path, run: RunState) -> list[RunSummary | None]:
+    """Return the summary of each recording of a run; None if there is none yet."""
+    summaries: list[RunSummary | None] = []
+    for part in run.parts:
+        try:
+            path = folder / part.folder / "summary.json"
+            summaries.append(RunSummary.read(path, "resume the campaign"))
+        except InputError:
+            summaries.append(None)
+    return summaries
+
+
+def with_summary(part: RunPart, summary: RunSummary) -> RunPart:
     """Return a copy of the part with verdict, measured steps and hash from its summary."""
     return part.model_copy(
         update={
-            "verdict": summary["verdict"],
-            "reason": summary["reason"],
-            "measured": tuple(step["index"] for step in summary["steps"] if step["measured"]),
-            "gaps": summary["gaps"],
-            "sha256": summary["sha256"],
+            "verdict": summary.verdict,
+            "reason": summary.reason,
+            "measured": tuple(step.index for step in summary.steps if step.measured),
+            "gaps": summary.gaps,
+            "sha256": summary.sha256,
         }
     )
 

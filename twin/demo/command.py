@@ -11,7 +11,6 @@ import secrets
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -38,8 +37,9 @@ from twin.drawing.plot_style import (
 from twin.drawing.prc_drawing import break_at_jumps, plot_prc
 from twin.laws.library import find_effect
 from twin.live.run_command import run_test
+from twin.results.contracts import RunSummary
 from twin.results.report_data import extract_prc
-from twin.results.summary import parse_jumps, prc_points
+from twin.results.summary import prc_points
 from twin.results.twin_verdict import format_misfit
 from twin.setup.folders import make_output_folder, make_run_folder
 from twin.system.files import open_in_browser
@@ -80,15 +80,15 @@ class TwinError:
 
     error: float
     noise_floor: float
-    summary: dict[str, Any]
+    summary: RunSummary
 
     @property
     def verdict(self) -> str:
         """Verdict on the twin."""
-        return str(self.summary["twin_verdict"]["verdict"])
+        return self.summary.twin_verdict.verdict if self.summary.twin_verdict else "not judged"
 
     def __str__(self) -> str:
-        misfit = format_misfit(self.summary["twin_verdict"])
+        misfit = format_misfit(self.summary.twin_verdict)
         return f"the twin {self.verdict}, {100 * self.error:.2g} % of the motion off, {misfit}"
 
 
@@ -196,9 +196,9 @@ def _run_twin(folder: Path, name: str, model: str | None) -> int:
 
 def read_twin_error(run: Path) -> TwinError:
     """Read the error of the twin from the summary of a run."""
-    summary = json.loads((run / "summary.json").read_text(encoding="utf-8"))
-    entry = summary["comparison"][CHANNEL]
-    return TwinError(entry["nrmse"], entry["noise_floor"], summary)
+    summary = RunSummary.read(run / "summary.json", "run the demonstration again")
+    error = summary.comparison[CHANNEL]
+    return TwinError(error.nrmse or math.nan, error.noise_floor or math.nan, summary)
 
 
 def _describe_verdict(verdict: Verdict) -> str:
@@ -271,9 +271,11 @@ def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
     runs = {"first run, model as it was": before, "second run, effect added": after}
     panels = figure.subplots(1, len(runs), sharex=True, sharey=True)
     for panel, (title, run) in zip(panels, runs.items(), strict=True):
-        points = prc_points(run.summary["steps"])
-        for source, make_style in (("measured", _rig_style), ("twin", _twin_style)):
-            jumps = parse_jumps(run.summary, source)
+        points = prc_points(run.summary.steps)
+        for source, jumps, make_style in (
+            ("measured", run.summary.jumps, _rig_style),
+            ("twin", run.summary.twin_jumps, _twin_style),
+        ):
             curves = break_at_jumps(partial(extract_prc, points, source), jumps)
             plot_prc([(panel, {"eta_d": 1})], curves, make_style)
         panel.set_title(f"{title}: twin error {100 * run.error:.2g} %")

@@ -8,7 +8,7 @@ from twin.results.report_data import ReportData, read_initial_model
 def follow_model_branches(run: ReportData) -> BranchSet | None:
     """Follow the main branches of the model over the steps of a run; None without any."""
     model, steps = read_initial_model(run), run.recording.start.steps
-    if model is None or None in (run.summary.get("u_star_m"), run.summary.get("a_star_m_s2")):
+    if model is None or run.summary.stars is None:
         return None
     branches = follow_sweep_branches(
         model,

@@ -21,11 +21,11 @@ REFUSED_COLOUR = "#f4ac3d"
 
 def draw_orbits(run: ReportData) -> CaptionedFigures:
     """Draw amplitude, feedback and Floquet multiplier of the measured orbits over frequency."""
-    orbits = run.summary.get("orbits") or []
+    orbits = run.orbits
     if not orbits:
         return
     branch = read_planned_branch(parse_toml_tables(run.recording.start.profile_toml))
-    measured = [orbit for orbit in orbits if orbit["multiplier_sd"] is not None]
+    measured = [orbit for orbit in orbits if orbit.multiplier_sd is not None]
     is_backbone = branch is not None and branch.is_backbone
     heights = (2.2, 1.0, 1.2) if measured or is_backbone else (2.2, 1.0)
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.2 if len(heights) == 2 else 8.0))
@@ -45,28 +45,26 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         (True, DIRECTION_COLOURS["forward"], "measured"),
         (False, REFUSED_COLOUR, "not accepted"),
     ):
-        own = [orbit for orbit in orbits if orbit["accepted"] is is_accepted]
-        frequencies = np.array([orbit["frequency_hz"] for orbit in own])
-        amplitudes = np.array([orbit["amplitude_m"] for orbit in own])
-        shares = np.array([orbit["feedback_share"] for orbit in own])
+        own = [orbit for orbit in orbits if orbit.accepted is is_accepted]
+        frequencies = np.array([orbit.frequency_hz for orbit in own])
+        amplitudes = np.array([orbit.amplitude_m for orbit in own])
+        shares = np.array([orbit.feedback_share for orbit in own])
         if own:
             branch_axis.plot(frequencies, 1e3 * amplitudes, "o", color=colour, label=label)
             feedback_axis.plot(frequencies, 100 * shares, "o", color=colour)
-    folds = run.summary.get("folds") or []
+    folds = run.summary.folds
     if folds:
         branch_axis.plot(
-            [fold["frequency_hz"] for fold in folds],
-            [1e3 * fold["amplitude_m"] for fold in folds],
+            [fold.frequency_hz for fold in folds],
+            [1e3 * fold.amplitude_m for fold in folds],
             "x", color=DIRECTION_COLOURS["backward"], label="fold, by its neighbours",
         )  # fmt: skip
     noise = [
-        orbit["noise_m"] * orbit["feedback_share"] / orbit["feedback_m"]
-        if orbit["feedback_m"]
-        else np.nan
+        orbit.noise_m * orbit.feedback_share / orbit.feedback_m if orbit.feedback_m else np.nan
         for orbit in orbits
     ]
     feedback_axis.plot(
-        [orbit["frequency_hz"] for orbit in orbits], 100 * np.array(noise), "_",
+        [orbit.frequency_hz for orbit in orbits], 100 * np.array(noise), "_",
         color=GUIDE_COLOUR, label="explained by sensor noise",
     )  # fmt: skip
     branch_axis.set_ylabel("amplitude of $u$ in mm")
@@ -74,8 +72,8 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     feedback_axis.set_yscale("log")
     if is_backbone:
         axes[2].plot(
-            [orbit["frequency_hz"] for orbit in orbits],
-            [orbit["phase_deg"] for orbit in orbits],
+            [orbit.frequency_hz for orbit in orbits],
+            [orbit.phase_deg for orbit in orbits],
             "o", color=DIRECTION_COLOURS["forward"],
         )  # fmt: skip
         axes[2].axhline(90.0, color=GUIDE_COLOUR, lw=0.8)
@@ -84,9 +82,9 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         if branch is not None:
             axes[2].plot(branch.frequencies_hz, branch.multipliers, color=TWIN_COLOUR, lw=1.0)
         axes[2].errorbar(
-            [orbit["frequency_hz"] for orbit in measured],
-            [orbit["multiplier"] for orbit in measured],
-            [orbit["multiplier_sd"] for orbit in measured],
+            [orbit.frequency_hz for orbit in measured],
+            [orbit.multiplier for orbit in measured],
+            [orbit.multiplier_sd for orbit in measured],
             fmt="o", color=DIRECTION_COLOURS["forward"], capsize=2.0,
         )  # fmt: skip
         axes[2].axhline(1.0, color=GUIDE_COLOUR, lw=0.8)
@@ -94,7 +92,7 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     axes[-1].set_xlabel("frequency in Hz")
     branch_axis.legend()
     feedback_axis.legend()
-    accepted = sum(orbit["accepted"] for orbit in orbits)
+    accepted = sum(orbit.accepted for orbit in orbits)
     if is_backbone:
         yield CaptionedFigure(
             "orbits",

@@ -21,6 +21,7 @@ from twin.drawing.plot_style import (
     DirectionStyle,
     LineStyle,
 )
+from twin.results.contracts import HysteresisInterval, Jump
 from twin.results.report_data import DIRECTIONS, Curve
 
 Curves = Callable[[str, str], Curve]  # of a direction and a quantity
@@ -84,7 +85,7 @@ def plot_prc(panels: Iterable[Panel], curves: Curves, make_style: DirectionStyle
             ax.set_ylim(bottom=0)
 
 
-def break_at_jumps(curves: Curves, jumps: Sequence[PrcJump]) -> Curves:
+def break_at_jumps(curves: Curves, jumps: Sequence[PrcJump | Jump]) -> Curves:
     """Return the curves with a NaN between the two points of each jump of their direction."""
 
     def broken(direction: str, name: str) -> Curve:
@@ -98,7 +99,9 @@ def break_at_jumps(curves: Curves, jumps: Sequence[PrcJump]) -> Curves:
     return broken
 
 
-def shade_hysteresis(panels: Iterable[Panel], intervals: Iterable[Hysteresis]) -> None:
+def shade_hysteresis(
+    panels: Iterable[Panel], intervals: Iterable[Hysteresis | HysteresisInterval]
+) -> None:
     """Shade hysteresis intervals, yellow right and cyan left."""
     for ax, _ in panels:
         for interval in intervals:
@@ -126,7 +129,7 @@ def shade_precompression(
 
 
 def draw_jumps(
-    panels: Iterable[Panel], curves: Curves, jumps: Sequence[PrcJump], label_in: str = ""
+    panels: Iterable[Panel], curves: Curves, jumps: Sequence[PrcJump | Jump], label_in: str = ""
 ) -> None:
     """Draw an arrow per jump in every panel; label them in the panel of the quantity `label_in`.
 
@@ -155,6 +158,6 @@ def draw_jumps(
                     )  # fmt: skip
 
 
-def _format_jump(jump: PrcJump) -> str:
+def _format_jump(jump: PrcJump | Jump) -> str:
     low, high = sorted((jump.from_hz, jump.to_hz))
     return f"{low:g}–{high:g} Hz"

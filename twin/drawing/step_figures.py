@@ -53,7 +53,7 @@ def draw_legend(
     directions = [
         direction
         for direction in DIRECTIONS
-        if any(step["direction"] == direction for step in run.steps)
+        if any(step.direction == direction for step in run.steps)
     ]
     if run.source == "measured":
         lines += direction_handles(
@@ -130,8 +130,8 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
 def _find_bands(run: ReportData, direction: str, hz: float) -> dict[str, float]:
     """Return the tolerance of u in m and of a in m/s2 at a step; empty if it is unknown."""
     for step in run.steps:
-        if step["direction"] == direction and step["frequency_hz"] == hz:
-            return {name: entry["band"] for name, entry in (step.get("agreement") or {}).items()}
+        if step.direction == direction and step.frequency_hz == hz:
+            return {name: misfit.band for name, misfit in step.agreement.items()}
     return {}
 
 

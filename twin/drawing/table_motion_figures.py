@@ -73,19 +73,18 @@ class MotionDrawing:
 
 def draw_table_motion(run: ReportData) -> CaptionedFigures:
     """Draw the motion of the table against its target, and the shocks of the specimen."""
-    tracking = run.summary.get("tracking")
+    tracking = run.summary.tracking
     if not tracking:
         return
     profile = parse_toml(run.recording.start.profile_toml, Profile, "recorded profile")
     motion = find_table_motion(run.recording, profile)
     if motion is None:
         return
-    low_hz, high_hz = tracking["band_hz"]
     drawing = MotionDrawing(
         motion,
-        delay_record(motion.target_acc_m_s2, tracking["lag_s"], motion.rate_hz),
-        delay_record(motion.target_disp_m, tracking["lag_s"], motion.rate_hz),
-        (low_hz, high_hz),
+        delay_record(motion.target_acc_m_s2, tracking.lag_s, motion.rate_hz),
+        delay_record(motion.target_disp_m, tracking.lag_s, motion.rate_hz),
+        tracking.band_hz,
         profile,
     )
     yield _draw_acceleration(drawing)
@@ -262,10 +261,10 @@ def _draw_fourier_and_energy(drawing: MotionDrawing) -> CaptionedFigure:
 def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigures:
     """Draw the shock response spectrum of the acceleration of the mass, where it hits a bumper."""
     impacts = sum(
-        (window.get(source) or {}).get(name) or 0
+        (window_motion.impacts_right or 0) + (window_motion.impacts_left or 0)
         for window in run.windows
-        for source in ("measured", "twin")
-        for name in ("impacts_right", "impacts_left")
+        for window_motion in (window.measured, window.twin)
+        if window_motion is not None
     )
     records = dict(_extract_mass_records(run, motion))
     if not impacts or "measured" not in records:

@@ -33,7 +33,7 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
     if not windows:
         return
     rate_hz = run.recording.start.rate_hz
-    first, end = round(windows[0]["from_s"] * rate_hz), round(windows[-1]["to_s"] * rate_hz)
+    first, end = round(windows[0].from_s * rate_hz), round(windows[-1].to_s * rate_hz)
     measured = cut_blocks(run.streams["meas"], first, end)
     twin = [extract_free_twin(block) for block in cut_blocks(run.streams["pred"], first, end)]
     rows = 4 if run.has_bumpers else 3
@@ -71,9 +71,9 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
     for axis, label in zip(axes, labels, strict=False):
         axis.set_ylabel(label)
         for window in windows[1::2]:
-            axis.axvspan(window["from_s"], window["to_s"], color=GUIDE_COLOUR, alpha=0.07, lw=0)
+            axis.axvspan(window.from_s, window.to_s, color=GUIDE_COLOUR, alpha=0.07, lw=0)
     axes[-1].set_xlabel("time in s")
-    axes[-1].set_xlim(windows[0]["from_s"], windows[-1]["to_s"])
+    axes[-1].set_xlim(windows[0].from_s, windows[-1].to_s)
     caption = (
         "Wide and pale: measured. Black: twin, free-running on the measured table acceleration; "
         "after an impact in a chaotic motion it cannot be reproduced sample by sample. Residual: "

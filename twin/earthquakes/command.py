@@ -115,12 +115,12 @@ def _iterate(
         tracking = summarise_tracking(recording, profile)
         if tracking is None:
             raise InputError("the run has no motion of the table to judge", where=run_folder)
-        errors.append(tracking["acc_rms_error_band"])
+        errors.append(tracking.acc_rms_error_band)
         rows.add_row(
             str(number),
             f"{100 * errors[-1]:.2f} %",
-            f"{100 * tracking['pga_ratio_band']:.1f} %",
-            f"{100 * tracking['sa_share']:.0f} %",
+            f"{100 * tracking.pga_ratio_band:.1f} %",
+            f"{100 * tracking.sa_share:.0f} %",
         )
         if number and errors[-1] > STOP_RATIO * min(errors):
             console.print("the error grows: no further iteration")

@@ -1,14 +1,18 @@
 """`prc` and `report`: response curves and report of a recording."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
-from twin.results import summary as summaries
+from twin.results.contract import format_json
+from twin.results.contracts import RunSummary
 from twin.results.recordings import open_recording, read_recorded_config
+from twin.results.summary import summarise
 from twin.studies import DEFINITION_FILE, TABLE_FILE
 from twin.system.terminal import console, print_line
 
+CURVE_KEYS = ("run", "u_star_m", "a_star_m_s2", "steps", "jumps", "hysteresis")
 FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
 
 
@@ -16,17 +20,12 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
     """Print the PRC of a recording, or of every run of a campaign, as a table or JSON."""
     from twin.report.prc_table import print_prc
 
-    keys = ("run", "u_star_m", "a_star_m_s2", "steps", "jumps", "hysteresis")
     if (log / STATE_FILE).is_file():
         from twin.campaign.summary import read_campaign
 
         runs = [run.summary for run in read_campaign(log).runs if run.profile.steps]
         if as_json:
-            print(
-                summaries.dump_strict_json(
-                    {"runs": [{key: run[key] for key in keys} for run in runs]}
-                )
-            )
+            print(format_json({"runs": [_select_curves(run) for run in runs]}))
         for run in runs if not as_json else ():
             print_prc(console, run)
         return
@@ -38,11 +37,17 @@ def print_recording_prc(log: Path, as_json: bool) -> None:
             allowed="recordings of a stepped sine",
             remedy="see the windows in summary.json, or in report.html by `shaketwin report`",
         )
-    summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
+    summary = summarise(recording, read_recorded_config(recording).parameters)
     if as_json:
-        print(summaries.dump_strict_json({key: summary[key] for key in keys}))
+        print(format_json(_select_curves(summary)))
     else:
         print_prc(console, summary)
+
+
+def _select_curves(summary: RunSummary) -> Mapping[str, object]:
+    """Return the part of a summary that is printed as JSON."""
+    plain = summary.to_plain()
+    return {key: plain[key] for key in CURVE_KEYS}
 
 
 def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = False) -> None:
@@ -78,8 +83,8 @@ def write_folder_report(folder: Path, as_pdf: bool = False, all_formats: bool = 
         return
     recording = open_recording(folder)
     if not (folder / "summary.json").exists():
-        summary = summaries.summarise(recording, read_recorded_config(recording).parameters)
-        summaries.write_summary(summary, folder / "summary.json")
+        summary = summarise(recording, read_recorded_config(recording).parameters)
+        summary.write(folder / "summary.json")
     print_line(f"{write_report(folder, recording, FIGURE_FORMATS if all_formats else ())}")
     if as_pdf:
         from twin.report.pdf_report import write_pdf_report

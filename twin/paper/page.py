@@ -15,8 +15,8 @@ from twin.paper.secondary_resonances import draw_secondary_resonance_figure
 from twin.paper.sketches import draw_sketches
 from twin.paper.study import PaperStudy
 from twin.paper.table import VERDICTS, ComparisonRow
+from twin.results.contract import format_json
 from twin.results.measured_campaign import MeasuredCampaign
-from twin.results.summary import dump_strict_json
 from twin.setup.run_config import read_model
 
 PAPER_MODEL = "snm"
@@ -102,7 +102,7 @@ def write_paper_json(
         },
         "figures": [f"figures/{picture.path.name}" for picture in pictures],
     }
-    path.write_text(dump_strict_json(document) + "\n", encoding="utf-8")
+    path.write_text(format_json(document) + "\n", encoding="utf-8")
 
 
 def write_paper_page(

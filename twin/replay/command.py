@@ -3,7 +3,7 @@
 import csv
 import math
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,8 @@ from twin.replay.pipeline_replay import (
 )
 from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, finalize_run
 from twin.results import summary as summaries
+from twin.results.contract import write_json
+from twin.results.contracts import Jump, ReplayResult, Response, RunSummary
 from twin.results.recordings import read_recorded_config, warn_if_damaged
 from twin.results.rerun import DRIVE_CHANNEL
 from twin.security.credentials import Credentials
@@ -36,7 +38,7 @@ from twin.setup.run_config import RunConfig
 from twin.setup.warm_up import compile_kernels
 from twin.system.progress import RunProgress
 from twin.system.terminal import console, print_line, print_table
-from twin.system.versions import VersionPairs, find_version_changes, format_version_changes
+from twin.system.versions import find_version_changes, format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item
 from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC
 
@@ -147,37 +149,10 @@ def _replay_one(request: ReplayRequest) -> int:
             recorded, config, folder / "run.mcap", run, on_item, span, block_samples
         )
     entry = describe_replay(recorded, config, model, identity, folder / "run.mcap")
-    code = finalize_run(folder, config, request.view, {"replay": asdict(entry)})
+    code = finalize_run(folder, config, request.view, entry)
     print_line(format_identity(identity, entry))
     same = config.model_toml == recorded.start.model_toml
     return EXIT_NOT_IDENTICAL if same and identity.differs else code
-
-
-@dataclass(frozen=True, slots=True)
-class ReplayEntry:
-    """Entry `replay` of a replay's summary.json; the fields, in this order, are its keys."""
-
-    of: str
-    run: str
-    model: str | None
-    identical: bool | None
-    beginning: str | None
-    comparisons: int
-    compared: int
-    differing: int
-    missing: int
-    unrecorded: int
-    lost_with_twin: int
-    hashes: int
-    hashes_compared: int
-    hashes_differing: int
-    predictions_compared: int
-    predictions_differing: int
-    first_difference_index: int | None
-    largest_difference_of_error_sums: dict[str, float]
-    relative_difference: dict[str, float | None]
-    versions_differing: VersionPairs
-    recorded_comparison: dict[str, dict[str, float | None]]
 
 
 def describe_replay(
@@ -186,13 +161,13 @@ def describe_replay(
     model: str | None,
     identity: ReplayComparison,
     log: Path,
-) -> ReplayEntry:
+) -> ReplayResult:
     """Compare a replay with its recording."""
     recording = recorded.recording
     same = config.model_toml == recording.start.model_toml
     payloads = [payload for _, payload in sorted(recorded.comparisons.items())]
     recorded_items = [*iter_valid_items(CMP_TOPIC, payloads, recording.start, [])]
-    return ReplayEntry(
+    return ReplayResult(
         of=str(recording.path),
         run=recording.run,
         model=RECORDED if same else model,
@@ -222,7 +197,7 @@ def describe_replay(
     )
 
 
-def format_identity(identity: ReplayComparison, entry: ReplayEntry) -> str:
+def format_identity(identity: ReplayComparison, entry: ReplayResult) -> str:
     """Format in one line whether a replay is identical, or the differences and their cause."""
     if identity.is_identical:
         lost = identity.lost_with_twin
@@ -244,7 +219,9 @@ def format_identity(identity: ReplayComparison, entry: ReplayEntry) -> str:
     if entry.relative_difference:
         parts.append(describe_deviation(entry.relative_difference))
     if entry.model == RECORDED:
-        version_changes = format_version_changes(entry.versions_differing)
+        version_changes = format_version_changes(
+            {name: dict(pair) for name, pair in entry.versions_differing.items()}
+        )
         parts.append(f"versions: {version_changes or 'all that were recorded are the same'}")
     return "; ".join([*parts, "see summary.json, replay"])
 
@@ -296,9 +273,8 @@ def replay_all(request: ReplayRequest) -> int:
             summary = summaries.summarise(
                 read_recording(new_log, TOPIC_TYPES.keys() - {PRED_TOPIC}), config.parameters
             )
-            summaries.write_summary(
-                {**summary, "replay": asdict(entry)}, replay_folder / "summary.json"
-            )
+            summary.replay = entry
+            summary.write(replay_folder / "summary.json")
             print_line(f"{replay_folder.name}: {format_identity(identity, entry)}")
             rows.append({"log": name, "model": model, **_make_row(summary, entry)})
     _write_comparison(folder, rows)
@@ -349,58 +325,51 @@ def _name_logs(logs: list[Path]) -> list[str]:
     return names
 
 
-def _make_row(summary: summaries.Json, entry: ReplayEntry) -> Row:
+def _make_row(summary: RunSummary, entry: ReplayResult) -> Row:
     """Return the comparison of one replay; errors as ratios, None if not comparable."""
     nrmse = {
-        f"{kind} {channel}": values[kind]
-        for channel, values in summary["comparison"].items()
+        f"{kind} {channel}": getattr(error, kind)
+        for channel, error in summary.comparison.items()
         for kind in ("nrmse", "free_nrmse")
     }
-    pairs = [
-        (step["measured"], step["twin"])
-        for step in summary["steps"]
-        if step["measured"] and step["twin"]
-    ]
+    pairs = [(step.measured, step.twin) for step in summary.steps if step.measured and step.twin]
     return {
         "same_model": entry.model == RECORDED,
         "identical": entry.identical,
-        "gaps": summary["gaps"],
+        "gaps": summary.gaps,
         **nrmse,
         **{f"prc {name}": _prc_error(pairs, name) for name in PRC_QUANTITIES},
         "steps": len(pairs),
         "steps_with_the_same_impacts": sum(
             _count_impacts(rig) == _count_impacts(twin) for rig, twin in pairs
         ),
-        "jumps": _format_jumps(summary["jumps"]),
-        "twin_jumps": _format_jumps(summary["twin_jumps"]),
+        "jumps": _format_jumps(summary.jumps),
+        "twin_jumps": _format_jumps(summary.twin_jumps),
     }
 
 
-def _prc_error(pairs: list[tuple[summaries.Json, summaries.Json]], name: str) -> float | None:
+def _prc_error(pairs: list[tuple[Response, Response]], name: str) -> float | None:
     """Return the relative error of a PRC quantity: rms of twin minus measured over rms measured."""
-    known = [
-        (rig[name], twin[name])
-        for rig, twin in pairs
-        if math.isfinite(rig[name]) and math.isfinite(twin[name])
-    ]
+    values = [(getattr(rig, name), getattr(twin, name)) for rig, twin in pairs]
+    known = [(rig, twin) for rig, twin in values if math.isfinite(rig) and math.isfinite(twin)]
     signal = sum(rig**2 for rig, _ in known)
     return math.sqrt(sum((twin - rig) ** 2 for rig, twin in known) / signal) if signal else None
 
 
-def _count_impacts(values: summaries.Json) -> tuple[int, ...]:
+def _count_impacts(response: Response) -> tuple[int, int]:
     """Return the impacts of a whole step, right and left.
 
     Twin and rig cut cycles at different samples, so that counts per cycle may differ.
     """
-    return tuple(sum(values[f"impacts_{side}"]) for side in ("right", "left"))
+    return sum(response.impacts_right), sum(response.impacts_left)
 
 
-def _format_jumps(jumps: list[summaries.Json]) -> str:
-    return ", ".join(f"{jump['kind']} {jump['from_hz']:g}-{jump['to_hz']:g} Hz" for jump in jumps)
+def _format_jumps(jumps: list[Jump]) -> str:
+    return ", ".join(f"{jump.kind} {jump.from_hz:g}-{jump.to_hz:g} Hz" for jump in jumps)
 
 
 def _write_comparison(folder: Path, rows: list[Row]) -> None:
-    summaries.write_json({"replays": rows}, folder / "comparison.json")
+    write_json({"replays": rows}, folder / "comparison.json")
     names = list(dict.fromkeys(name for row in rows for name in row))
     with (folder / "comparison.csv").open("x", newline="") as file:
         writer = csv.DictWriter(file, names)

@@ -16,9 +16,9 @@ from twin.recording.reader import Recording, select_messages
 from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
 from twin.recording.run_paths import explain_unmerged_parts as scattered
 from twin.report.finalize import EXIT_GAPS
+from twin.results.contract import format_json
 from twin.results.recordings import list_parts, read_recorded_config
 from twin.results.sensor_table import SensorRow, build_sensor_rows
-from twin.results.summary import dump_strict_json
 from twin.system.terminal import console, print_line, print_table
 from twin.system.versions import (
     VersionPairs,
@@ -130,7 +130,7 @@ def verify_logs(logs: list[Path], as_json: bool, repair: Path | None) -> int:
     """Verify a log or its parts, print the report, repair if asked; return the exit code."""
     verification = verify(*logs)
     if as_json:
-        print(dump_strict_json(asdict(verification.report)))
+        print(format_json(asdict(verification.report)))
     else:
         print_verification(verification.report, advise=repair is None)
     if repair is not None:

@@ -1,16 +1,17 @@
 """`compare`: two runs side by side, on the console, as JSON and as a page."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 from rich.table import Table
 
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
-from twin.report.run_comparison import ComparedRun, compare_summaries
-from twin.results.contracts import SummaryKeys
+from twin.report.run_comparison import ComparedRun, RunComparison, compare_summaries
+from twin.results.contract import format_json, write_json
+from twin.results.contracts import RunSummary
 from twin.results.quantities import format_quantity
 from twin.results.recordings import read_recorded_config
-from twin.results.summary import Json, dump_strict_json, load_summary, write_json
 from twin.setup.folders import make_run_folder
 from twin.system.terminal import console, print_line, print_table
 
@@ -23,7 +24,7 @@ def compare_runs(first: Path, second: Path, as_json: bool, out: Path | None) -> 
     runs = [_load_run(path) for path in (first, second)]
     comparison = compare_summaries(*runs)
     if as_json:
-        print(dump_strict_json(comparison))
+        print(format_json(asdict(comparison)))
     else:
         _print_comparison(comparison)
     if as_json and out is None:
@@ -31,7 +32,7 @@ def compare_runs(first: Path, second: Path, as_json: bool, out: Path | None) -> 
     from twin.report.run_comparison_page import write_comparison_page  # slow to import
 
     folder, _ = make_run_folder(out, "compare")
-    write_json(comparison, folder / "comparison.json")
+    write_json(asdict(comparison), folder / "comparison.json")
     page = write_comparison_page(folder, runs[0], runs[1], comparison)
     if not as_json:
         print_line(f"{page}")
@@ -40,39 +41,38 @@ def compare_runs(first: Path, second: Path, as_json: bool, out: Path | None) -> 
 def _load_run(path: Path) -> ComparedRun:
     log = resolve_log_path(path)
     recording = read_recording(log, ())
-    summary = load_summary(
-        log.parent / "summary.json", SummaryKeys, f"run `shaketwin report {log.parent}`"
-    )
+    summary = RunSummary.read(log.parent / "summary.json", f"run `shaketwin report {log.parent}`")
     parameters = read_recorded_config(recording).model.flatten()
     return ComparedRun(log.parent, recording, summary, parameters)
 
 
-def _print_comparison(comparison: Json) -> None:
+def _print_comparison(comparison: RunComparison) -> None:
     table = Table(title="Two runs")
     for head in ("", "first", "second"):
         table.add_column(head)
+    overviews = [asdict(run) for run in comparison.runs]
     for label, key in (("folder", "folder"), ("date", "started_at"), ("test", "title"),
                        ("model", "model"), ("test ended", "verdict"),
                        ("excitation", "excitation_verdict"), ("twin", "twin_verdict"),
                        ("warnings", "warnings")):  # fmt: skip
-        cells = ["-" if run[key] is None else str(run[key]) for run in comparison["runs"]]
+        cells = ["-" if row[key] is None else str(row[key]) for row in overviews]
         table.add_row(label, *cells)
-    for channel, error in comparison["misfit"].items():
-        shares = ["-" if nrmse is None else f"{100 * nrmse:.3g} %" for nrmse in error["nrmse"]]
+    for channel, misfit in comparison.misfit.items():
+        shares = ["-" if nrmse is None else f"{100 * nrmse:.3g} %" for nrmse in misfit.nrmse]
         table.add_row(f"misfit {channel}", *shares)
-    for source, jumps in comparison["jumps"].items():
+    for source, jumps in comparison.jumps.items():
         for jump in jumps:
-            places = ["none" if p is None else f"{p[0]:g}-{p[1]:g} Hz" for p in jump["between_hz"]]
-            table.add_row(f"{source} jump {jump['kind']}, {jump['direction']}", *places)
-    for row in comparison["estimates"]:
+            places = ["none" if p is None else f"{p[0]:g}-{p[1]:g} Hz" for p in jump.between_hz]
+            table.add_row(f"{source} jump {jump.kind}, {jump.direction}", *places)
+    for estimate in comparison.estimates:
         values = [
-            format_quantity(value, row["unit"], 2 * sd if sd is not None else None)
-            for value, sd in zip(row["values"], row["sd"], strict=True)
+            format_quantity(value, estimate.unit, 2 * sd)
+            for value, sd in zip(estimate.values, estimate.sd, strict=True)
         ]
-        mark = f" (changed, {row['sigma']:.2g} sigma)" if row["changed"] else ""
-        table.add_row(row["name"].replace("_", " ") + mark, *values)
-    for row in comparison["model"]:
-        if row["values"][0] != row["values"][1]:
-            values = [format_quantity(value, row["unit"], digits=5) for value in row["values"]]
-            table.add_row(f"model {row['name']}", *values)
+        mark = f" (changed, {estimate.sigma:.2g} sigma)" if estimate.changed else ""
+        table.add_row(estimate.name.replace("_", " ") + mark, *values)
+    for parameter in comparison.model:
+        if parameter.values[0] != parameter.values[1]:
+            values = [format_quantity(v, parameter.unit, digits=5) for v in parameter.values]
+            table.add_row(f"model {parameter.name}", *values)
     print_table(console, table)

@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block
 from table_io.units import GRAVITY_M_S2
-from twin.compare.curves import Hysteresis
 from twin.drawing.branch_curves import FREE_QUANTITIES
 from twin.drawing.branch_figures import branch_handles, plot_branches
 from twin.drawing.model_branches import follow_model_branches
@@ -58,7 +57,6 @@ from twin.results.report_data import (
     compute_step_errors,
     extract_prc,
 )
-from twin.results.summary import parse_jumps
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 
@@ -105,11 +103,11 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
     axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
     panels = make_prc_panels(axes, contents)
-    intervals = [Hysteresis(**interval) for interval in run.summary.get("hysteresis") or []]
+    intervals = run.summary.hysteresis
     prestress = compute_prestress(run)
     shade_hysteresis(panels, intervals)
     shade_precompression(panels, prestress)
-    jumps, twin_jumps = (parse_jumps(run.summary, source) for source in ("measured", "twin"))
+    jumps, twin_jumps = run.summary.jumps, run.summary.twin_jumps
     measured_jumps = jumps if run.source == "measured" else []
     plot_prc(panels, break_at_jumps(measured, measured_jumps), _dotted_style)
     plot_prc(panels, break_at_jumps(twin, twin_jumps), twin_style)
@@ -136,10 +134,10 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
 
 def _draw_model_branches(run: ReportData) -> CaptionedFigures:
     """Draw the points over the model's branches, stable and unstable, between the jumps."""
-    branches = follow_model_branches(run)
-    if not branches:
+    branches, stars = follow_model_branches(run), run.summary.stars
+    if branches is None or stars is None:
         return
-    scales = {"eta_d": run.summary["u_star_m"], "eta_a": run.summary["a_star_m_s2"]}
+    scales = dict(zip(("eta_d", "eta_a"), stars, strict=True))
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
     axes = figure.subplots(1, 2, sharex=True, squeeze=False)
     panels = make_prc_panels(axes, FREE_PANELS)
@@ -234,10 +232,10 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
             steps = [
                 step
                 for step in run.steps
-                if step["direction"] == direction and step["index"] in step_nrmse
+                if step.direction == direction and step.index in step_nrmse
             ]
-            f = [step["frequency_hz"] for step in steps]
-            nrmse = np.array([step_nrmse[step["index"]] for step in steps]).reshape(-1, 2)
+            f = [step.frequency_hz for step in steps]
+            nrmse = np.array([step_nrmse[step.index] for step in steps]).reshape(-1, 2)
             ax.semilogy(f, nrmse[:, 0], "o-", color=DIRECTION_COLOURS[direction], lw=0.9)
             ax.semilogy(
                 f, nrmse[:, 1], "o:", color=DIRECTION_COLOURS[direction], lw=0.9, mfc="white"
@@ -300,8 +298,7 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
 
 
 def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labels: bool) -> None:
-    visits = run.summary.get("visits") or []
-    steps_by_index = {step["index"]: step for step in (*run.steps, *visits)}
+    steps_by_index = {step.index: step for step in (*run.steps, *run.summary.visits)}
     duration_s = blocks[-1].time_s[-1] - blocks[0].time_s[0]
     next_label_s = 0.0
     for block in blocks:
@@ -311,14 +308,14 @@ def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labe
             if step is None:
                 continue
             start, stop = block.time_s[first], block.time_s[last - 1]
-            shade = 0.20 if step["index"] % 2 else 0.09
+            shade = 0.20 if step.index % 2 else 0.09
             ax.axvspan(
-                start, stop, color=DIRECTION_COLOURS[step["direction"]], alpha=shade, lw=0, zorder=0
+                start, stop, color=DIRECTION_COLOURS[step.direction], alpha=shade, lw=0, zorder=0
             )
             if show_labels and start >= next_label_s:
                 middle = (start + stop) / 2
                 ax.annotate(
-                    f"{step['frequency_hz']:g}", (middle, 1.02), xycoords=("data", "axes fraction"),
+                    f"{step.frequency_hz:g}", (middle, 1.02), xycoords=("data", "axes fraction"),
                     ha="center", size=8, color=GUIDE_COLOUR,
                 )  # fmt: skip
                 next_label_s = start + duration_s / 22
@@ -329,26 +326,26 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
 
     The uncorrected level is the measured level divided by the correction.
     """
-    steps = [step for step in run.steps if step.get("level") and step["level"]["accepted"]]
-    if not steps:
+    levels = [(step, step.level) for step in run.steps if step.level and step.level.accepted]
+    if not levels:
         return
     figure = Figure(figsize=(9.5, 4.6))
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     for direction in DIRECTIONS:
         own = sorted(
-            (step for step in steps if step["direction"] == direction),
-            key=lambda step: step["frequency_hz"],
+            (step.frequency_hz, level.error, level.error_uncorrected, level.correction)
+            for step, level in levels
+            if step.direction == direction
         )
         if not own:
             continue
-        f, colour = [step["frequency_hz"] for step in own], DIRECTION_COLOURS[direction]
-        for name, label, style in (
-            ("error", direction, {"ls": "-", "marker": "o", "ms": 3}),
-            ("error_uncorrected", f"{direction}, uncorrected", {"ls": ":", "lw": 1.2}),
-        ):
-            errors = [100 * step["level"][name] for step in own]
-            upper.plot(f, errors, color=colour, label=label, **style)
-        lower.plot(f, [step["level"]["correction"] for step in own], "o-", color=colour, ms=3)
+        f, errors, uncorrected, corrections = np.array(own).T
+        colour = DIRECTION_COLOURS[direction]
+        upper.plot(f, 100 * errors, "o-", ms=3, color=colour, label=direction)
+        upper.plot(
+            f, 100 * uncorrected, ":", lw=1.2, color=colour, label=f"{direction}, uncorrected"
+        )
+        lower.plot(f, corrections, "o-", color=colour, ms=3)
     for tolerance_percent in (-2, 2):
         upper.axhline(tolerance_percent, color="#777777", lw=0.8, ls="--")
     upper.set_ylabel("level error in %")
@@ -359,7 +356,7 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
         "level",
         "Level of the table",
         f"Error of the fundamental of the measured table acceleration relative to the demanded "
-        f"{steps[0]['level']['demanded_m_s2'] / GRAVITY_M_S2:.3g} g over the measured cycles of "
+        f"{levels[0][1].demanded_m_s2 / GRAVITY_M_S2:.3g} g over the measured cycles of "
         "each step (dashed: ±2 %), the same without correction of the command (dotted), and the "
         "correction factor.",
         figure,

@@ -3,10 +3,11 @@
 from pathlib import Path
 
 from twin.recording.reader import read_recording
-from twin.results import summary as summaries
+from twin.results.contracts import ReplayResult, RunSummary
 from twin.results.excitation_verdict import format_excitation_verdict
 from twin.results.rerun import restore_predictions
-from twin.results.twin_verdict import NOTHING_MEASURED, format_twin_verdict
+from twin.results.summary import format_summary, summarise
+from twin.results.twin_verdict import format_twin_verdict
 from twin.setup.run_config import RunConfig
 from twin.system.terminal import console, print_line
 
@@ -21,36 +22,38 @@ EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
 def finalize_run(
-    folder: Path, run_config: RunConfig, view: bool = False, extra: summaries.Json | None = None
+    folder: Path, run_config: RunConfig, view: bool = False, replay: ReplayResult | None = None
 ) -> int:
     """Write summary, report and optional view, print a one-line summary; return the exit code."""
     from twin.report.report import write_report
 
     recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
-    summary = summaries.summarise(recording, run_config.parameters)
-    summary |= extra or {}
-    summaries.write_summary(summary, folder / "summary.json")
+    summary = summarise(recording, run_config.parameters)
+    if replay is not None:
+        summary.replay = replay
+    summary.write(folder / "summary.json")
     write_report(folder, recording)
     if view:
         from twin.viewer.view import write_rrd
 
         write_rrd(recording, folder / "view.rrd")
-    result = summaries.format_summary(summary, len(run_config.steps))
+    result = format_summary(summary, len(run_config.steps))
     print_line(f"test {result} -> {folder / 'report.html'}")
     print_twin_verdict(summary, folder)
-    if summary["verdict"] != "complete":
+    if summary.verdict != "complete":
         return EXIT_ABORTED
-    return EXIT_GAPS if summary["gaps"] else 0
+    return EXIT_GAPS if summary.gaps else 0
 
 
-def print_twin_verdict(summary: summaries.Json, folder: Path) -> None:
+def print_twin_verdict(summary: RunSummary, folder: Path) -> None:
     """Print the verdicts on excitation and twin, coloured; nothing without a twin."""
-    excitation, verdict = summary["excitation_verdict"], summary["twin_verdict"]
-    if verdict["reason"] == NOTHING_MEASURED:
+    excitation, verdict = summary.excitation_verdict, summary.twin_verdict
+    if verdict is None or not summary.is_twin_judged:
         return
-    _print_coloured(format_excitation_verdict(excitation), excitation["verdict"])
+    if excitation is not None:
+        _print_coloured(format_excitation_verdict(excitation), excitation.verdict)
     first, *lines = format_twin_verdict(verdict, folder)
-    _print_coloured(first, verdict["verdict"])
+    _print_coloured(first, verdict.verdict)
     for line in lines:
         print_line(f"  {line}")
 

@@ -14,7 +14,7 @@ from twin.report.figures import draw_figures
 from twin.report.report import format_headline
 from twin.results.excitation_verdict import format_excitation_verdict
 from twin.results.report_data import ReportData, step_quantity
-from twin.results.twin_verdict import NOTHING_MEASURED, format_twin_verdict
+from twin.results.twin_verdict import format_jump, format_twin_verdict
 
 PAGE_IN = (FIGURE_WIDTH_IN, FIGURE_WIDTH_IN * 2**0.5)  # as A4
 LINES_PER_PAGE, COLUMNS = 78, 122
@@ -24,7 +24,7 @@ STEP_COLUMNS = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 def write_pdf_report(run: ReportData, path: Path) -> None:
     """Write the report of a run as a PDF file; figures stay vectors, text can be searched."""
     with mpl.rc_context(RC_PARAMS | {"pdf.fonttype": 42}), PdfPages(path) as pdf:
-        title = str(run.summary["run"].get("title") or run.recording.start.name)
+        title = run.summary.run.title or run.recording.start.name
         for page in _make_text_pages(title, _describe_run(run)):
             pdf.savefig(page)
         for number, drawing in enumerate(draw_figures(run), 1):
@@ -39,27 +39,20 @@ def write_pdf_report(run: ReportData, path: Path) -> None:
 
 def _describe_run(run: ReportData) -> list[str]:
     summary, start = run.summary, run.recording.start
-    lines = [
-        f"Test {summary['verdict']} ({summary.get('reason') or ''}): {format_headline(run)}", "",
-    ]  # fmt: skip
-    verdict = summary.get("twin_verdict")
-    if verdict and verdict["reason"] != NOTHING_MEASURED:
-        if excitation := summary.get("excitation_verdict"):
-            lines.append(format_excitation_verdict(excitation))
-        lines += [*format_twin_verdict(verdict, run.recording.path.parent), ""]
+    lines = [f"Test {summary.verdict} ({summary.reason}): {format_headline(run)}", ""]
+    if summary.twin_verdict and summary.is_twin_judged:
+        if summary.excitation_verdict:
+            lines.append(format_excitation_verdict(summary.excitation_verdict))
+        lines += [*format_twin_verdict(summary.twin_verdict, run.recording.path.parent), ""]
     lines += [f"Run      {start.run}", f"Started  {start.started_at} on {start.host}"]
     lines.append(f"Gap      {_format_gap(run)}")
-    lines += [f"Model    {summary['run'].get('model') or 'not stated'}", "", "Jumps and hysteresis"]
-    lines += [
-        f"  {source}: {jump['direction']} jump {jump['kind']}, {jump['from_hz']:g} to "
-        f"{jump['to_hz']:g} Hz"
-        for source, key in (("measured", "jumps"), ("twin", "twin_jumps"))
-        for jump in summary.get(key) or []
-    ]
+    lines += [f"Model    {summary.run.model or 'not stated'}", "", "Jumps and hysteresis"]
+    lines += [f"  measured: {format_jump(jump)}" for jump in summary.jumps]
+    lines += [f"  twin: {format_jump(jump)}" for jump in summary.twin_jumps]
     lines += ["", "Warnings"]
     lines += [
-        f"  {warning['at_s']:.1f} s  {format_kind(warning['kind'])}: {warning['text']}"
-        for warning in summary.get("warnings") or ()
+        f"  {warning.at_s:.1f} s  {format_kind(warning.kind)}: {warning.text}"
+        for warning in summary.warnings
     ]
     return lines
 
@@ -80,7 +73,7 @@ def _tabulate_steps(run: ReportData) -> list[str]:
             for name in STEP_COLUMNS
         ]
         cells = "".join(f"{measured:8.3f}|{twin:<7.3f}" for measured, twin in pairs)
-        lines.append(f"{step['frequency_hz']:8.3f} {step['direction']:9}{cells}")
+        lines.append(f"{step.frequency_hz:8.3f} {step.direction:9}{cells}")
     return lines
 
 

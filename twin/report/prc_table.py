@@ -5,44 +5,33 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.table import Table
 
-from twin.results.summary import Json
+from twin.results.contracts import Response, RunSummary, StepEntry
 from twin.system.terminal import fits_width, print_table
 
-Cell = Callable[[Json], str]  # formats a value of the "measured" or "twin" entry of a step
+
+def _format_mean(counts: list[int]) -> str:
+    return f"{sum(counts) / len(counts):.3g}" if counts else "-"
 
 
-def _format_number(key: str) -> Cell:
-    def cell(values: Json) -> str:
-        value = values.get(key)
-        return "-" if value is None else f"{value:.3f}"
-
-    return cell
-
-
-def _format_mean(key: str) -> Cell:
-    def cell(values: Json) -> str:
-        counts = values.get(key)
-        return "-" if not counts else f"{sum(counts) / len(counts):.3g}"
-
-    return cell
-
-
-def _format_impacts(values: Json) -> str:
-    return f"{_format_mean('impacts_right')(values)}/{_format_mean('impacts_left')(values)}"
-
-
-COLUMNS: dict[str, Cell] = {
-    "eta_d": _format_number("eta_d"), "eta_a": _format_number("eta_a"),
-    "eta_R": _format_number("eta_r"), "eta_L": _format_number("eta_l"),
-    "r_R": _format_number("r_r"), "r_L": _format_number("r_l"),
-    "impacts R": _format_mean("impacts_right"), "impacts L": _format_mean("impacts_left"),
-    "impacts R/L": _format_impacts,
-}  # fmt: skip
+# How each column shows the response of specimen or twin.
+COLUMNS: dict[str, Callable[[Response], str]] = {
+    "eta_d": lambda response: f"{response.eta_d:.3f}",
+    "eta_a": lambda response: f"{response.eta_a:.3f}",
+    "eta_R": lambda response: f"{response.eta_r:.3f}",
+    "eta_L": lambda response: f"{response.eta_l:.3f}",
+    "r_R": lambda response: f"{response.r_r:.3f}",
+    "r_L": lambda response: f"{response.r_l:.3f}",
+    "impacts R": lambda response: _format_mean(response.impacts_right),
+    "impacts L": lambda response: _format_mean(response.impacts_left),
+    "impacts R/L": lambda response: (
+        f"{_format_mean(response.impacts_right)}/{_format_mean(response.impacts_left)}"
+    ),
+}
 ALL_COLUMNS = tuple(name for name in COLUMNS if name != "impacts R/L")
 COLUMN_SETS = (ALL_COLUMNS, ("eta_d", "eta_a", "impacts R/L"), ("eta_d", "impacts R/L"), ("eta_d",))
 
 
-def print_prc(console: Console, summary: Json) -> None:
+def print_prc(console: Console, summary: RunSummary) -> None:
     """Print the PRCs of a summary, measured | twin, then hysteresis intervals and jumps."""
     names = _fit_columns(console, summary)
     print_table(console, _build_table(summary, names))
@@ -52,11 +41,11 @@ def print_prc(console: Console, summary: Json) -> None:
             "use --json or widen the terminal",
             highlight=False,
         )
-    for text in (*summary.get("found", ()), *_format_branches(summary)):
+    for text in (*summary.findings, *_format_branches(summary)):
         console.print(text, highlight=False, soft_wrap=True)
 
 
-def _fit_columns(console: Console, summary: Json) -> tuple[str, ...]:
+def _fit_columns(console: Console, summary: RunSummary) -> tuple[str, ...]:
     """Return the largest set of columns that fits the console width, or the smallest set."""
     return next(
         (columns for columns in COLUMN_SETS if fits_width(console, _build_table(summary, columns))),
@@ -64,29 +53,32 @@ def _fit_columns(console: Console, summary: Json) -> tuple[str, ...]:
     )
 
 
-def _build_table(summary: Json, names: tuple[str, ...]) -> Table:
-    table = Table(title=f"{summary['run']['title']}: measured | twin")
+def _build_table(summary: RunSummary, names: tuple[str, ...]) -> Table:
+    table = Table(title=f"{summary.run.title}: measured | twin")
     table.add_column("direction")
     for name in ("f [Hz]", *names):
         table.add_column(name, justify="right")
-    for step in summary["steps"]:
+    for step in summary.steps:
         cells = [_format_pair(step, name) for name in names]
-        table.add_row(step["direction"], f"{step['frequency_hz']:.3f}", *cells)
+        table.add_row(step.direction, f"{step.frequency_hz:.3f}", *cells)
     return table
 
 
-def _format_pair(step: Json, name: str) -> str:
-    return " | ".join(COLUMNS[name](step[source] or {}) for source in ("measured", "twin"))
+def _format_pair(step: StepEntry, name: str) -> str:
+    cells = (
+        COLUMNS[name](response or Response()).replace("nan", "-")
+        for response in (step.measured, step.twin)
+    )
+    return " | ".join(cells)
 
 
-def _format_branches(summary: Json) -> list[str]:
+def _format_branches(summary: RunSummary) -> list[str]:
     """Format one line per hysteresis interval and per jump."""
     lines = [
-        f"{interval['kind']} hysteresis from {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
-        for interval in summary["hysteresis"]
+        f"{interval.kind} hysteresis from {interval.from_hz:g} to {interval.to_hz:g} Hz"
+        for interval in summary.hysteresis
     ] or ["no hysteresis of two or more grid frequencies"]
     return lines + [
-        f"jump {jump['kind']}, {jump['direction']}, between {jump['from_hz']:g} and "
-        f"{jump['to_hz']:g} Hz"
-        for jump in summary["jumps"]
+        f"jump {jump.kind}, {jump.direction}, between {jump.from_hz:g} and {jump.to_hz:g} Hz"
+        for jump in summary.jumps
     ]

@@ -6,7 +6,6 @@ Values from the summary are shown unchanged; the page loads nothing from outside
 from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -29,7 +28,7 @@ from twin.drawing.plot_style import Picture
 from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.reader import Recording, read_recording
 from twin.report.figures import draw_run_figures
-from twin.results.contracts import SummaryKeys
+from twin.results.contracts import LevelResult, MeasuredFold, OrbitResult, RunSummary
 from twin.results.excitation_verdict import list_level_errors
 from twin.results.report_data import (
     ReportData,
@@ -37,10 +36,9 @@ from twin.results.report_data import (
     step_quantity,
 )
 from twin.results.sensor_table import build_sensor_rows
-from twin.results.summary import load_summary, parse_toml_tables
+from twin.results.summary import parse_toml_tables
 from twin.results.table_motion import format_required, format_tracking
 from twin.results.twin_verdict import (
-    NOTHING_MEASURED,
     describe_worst,
     format_jump,
     format_misfit,
@@ -69,32 +67,42 @@ def write_report(
 def load_report_data(folder: Path, recording: Recording | None = None) -> ReportData:
     """Return the report data of a run's folder, from run.mcap and summary.json."""
     remedy = "give a folder written by run, replay or simulate"
-    summary = load_summary(folder / "summary.json", SummaryKeys, remedy)
+    summary = RunSummary.read(folder / "summary.json", remedy)
     return build_report_data(recording or read_recording(folder / "run.mcap"), summary)
 
 
 def render_report(run: ReportData, pictures: list[Picture]) -> str:
     """Render the report page as HTML text with every figure embedded."""
     start, recording = run.recording.start, run.recording
+    verdict = run.summary.twin_verdict if run.summary.is_twin_judged else None
     texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
     motion_pictures = [picture for picture in pictures if picture.path.stem in MOTION_FIGURES]
     other_pictures = [picture for picture in pictures if picture not in motion_pictures]
     demand = {step.index: step.acceleration_m_s2 for step in start.steps}
     # Summaries of older versions do not state the demand.
-    steps = [{"demanded_m_s2": demand.get(step["index"]), **step} for step in run.steps]
+    steps = [
+        step
+        if np.isfinite(step.demanded_m_s2)
+        else step.model_copy(update={"demanded_m_s2": demand.get(step.index, np.nan)})
+        for step in run.steps
+    ]
     return render_page(
         Path(__file__).with_name("report.html"),
         run=run,
         summary=run.summary,
         start=start,
         headline=format_headline(run),
-        **_describe_verdicts(run),
+        twin_verdict=verdict,
+        misfit=format_misfit(verdict),
+        describe_worst=describe_worst,
+        next_command=name_command(verdict, recording.path.parent) if verdict else "",
+        format_jump=format_jump,
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
         images=embed_images(other_pictures),
         motion_images=embed_images(motion_pictures),
         format_required=format_required,
         demand=demand,
-        level_errors={step["index"]: error for error, step in list_level_errors(steps)},
+        level_errors={step.index: error for error, step in list_level_errors(steps)},
         texts=[
             (name, sha256(text.encode()).hexdigest(), _shorten(text))
             for name, text in texts.items()
@@ -122,21 +130,6 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
     )
 
 
-def _describe_verdicts(run: ReportData) -> dict[str, Any]:
-    """Return the values of the page for the verdicts on excitation and twin; None without one."""
-    verdict = run.summary.get("twin_verdict")
-    if verdict is None or verdict["reason"] == NOTHING_MEASURED:
-        return {"twin_verdict": None, "excitation_verdict": None, "misfit": ""}
-    return {
-        "twin_verdict": verdict,
-        "excitation_verdict": run.summary.get("excitation_verdict"),
-        "misfit": format_misfit(verdict),
-        "worst": describe_worst(verdict["worst"]) if verdict["worst"] else None,
-        "next_command": name_command(verdict, run.recording.path.parent),
-        "format_jump": format_jump,
-    }
-
-
 def _shorten(text: str) -> str:
     """Return the beginning of a long text: a profile may hold a file of its excitation."""
     if len(text) <= MAX_TEXT_LENGTH:
@@ -150,37 +143,37 @@ def worst_level(run: ReportData) -> dict[str, float] | None:
 
     None if no step has level records.
     """
-    levels = [step["level"] for step in run.steps if step.get("level")]
+    levels: list[LevelResult] = [step.level for step in run.steps if step.level]
     if not levels:
         return None
     return {
-        "controlled": max(abs(level["error"]) for level in levels),
-        "uncontrolled": max(abs(level["error_uncorrected"]) for level in levels),
+        "controlled": max(abs(level.error) for level in levels),
+        "uncontrolled": max(abs(level.error_uncorrected) for level in levels),
         "updates": max(record.update for record in run.recording.records(Level)),
         "steps": len(levels),
     }
 
 
 def format_orbit_headline(
-    orbits: list[dict[str, Any]],
+    orbits: list[OrbitResult],
     planned: int,
     is_backbone: bool,
-    folds: Sequence[dict[str, Any]] = (),
+    folds: Sequence[MeasuredFold] = (),
 ) -> str:
     """Format the headline of a continuation: orbits accepted, range, feedback and folds."""
-    accepted = [orbit for orbit in orbits if orbit["accepted"]]
+    accepted = [orbit for orbit in orbits if orbit.accepted]
     if not accepted:
         return f"none of {planned} orbits measured."
-    unstable = [orbit for orbit in accepted if not orbit["stable"]] or accepted
-    frequencies = [orbit["frequency_hz"] for orbit in unstable]
-    share = max(orbit["feedback_share"] for orbit in accepted)
+    unstable = [orbit for orbit in accepted if not orbit.stable] or accepted
+    frequencies = [orbit.frequency_hz for orbit in unstable]
+    share = max(orbit.feedback_share for orbit in accepted)
     if is_backbone:
         return (
             f"{len(accepted)} of {planned} points of the backbone measured, "
             f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
             f"{100 * share:.2g} % of the command."
         )
-    turns = [f"; {fold['kind']} fold at {fold['frequency_hz']:.4f} Hz" for fold in folds]
+    turns = [f"; {fold.kind} fold at {fold.frequency_hz:.4f} Hz" for fold in folds]
     return (
         f"{len(accepted)} of {planned} orbits measured, {len(unstable)} of them unstable from "
         f"{min(frequencies):.4g} to {max(frequencies):.4g} Hz; feedback at most "
@@ -194,7 +187,7 @@ def format_headline(run: ReportData) -> str:
         planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
         kind = planned.get("kind", "history")
         headline = f"{len(run.windows)} windows of a displacement history ({kind}), open loop"
-        tracking = run.summary.get("tracking")
+        tracking = run.summary.tracking
         return f"{headline}; {format_tracking(tracking)}." if tracking else f"{headline}."
     if run.orbits:
         excitation = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
@@ -202,19 +195,19 @@ def format_headline(run: ReportData) -> str:
             run.orbits,
             len(run.recording.start.steps),
             excitation.get("kind") == "backbone",
-            run.summary.get("folds") or [],
+            run.summary.folds,
         )
-    done_count = sum(1 for step in run.steps if step.get("measured") or step.get("twin"))
+    done_count = sum(1 for step in run.steps if step.measured or step.twin)
     parts = [f"{done_count} of {len(run.recording.start.steps) or len(run.steps)} steps"]
     parts += [
-        f"{interval['kind']} hysteresis {interval['from_hz']:g} to {interval['to_hz']:g} Hz"
-        for interval in run.summary.get("hysteresis") or []
+        f"{interval.kind} hysteresis {interval.from_hz:g} to {interval.to_hz:g} Hz"
+        for interval in run.summary.hysteresis
     ] or ["no hysteresis"]
-    parts += run.summary.get("found") or []
+    parts += run.summary.findings
     eta_d = np.nan_to_num([step_quantity(step, run.source, "eta_d") for step in run.steps])
     if eta_d.any():
         peak_step = run.steps[int(np.argmax(eta_d))]
-        location = f"{peak_step['frequency_hz']:g} Hz {peak_step['direction']}"
+        location = f"{peak_step.frequency_hz:g} Hz {peak_step.direction}"
         parts.append(
             f"largest normalized excursion {format_significant(eta_d.max())} at {location}"
         )

@@ -6,11 +6,19 @@ Two tests on the table, or two replays of one recording with different models.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 from twin.laws.library import find_effect
 from twin.recording.reader import Recording
-from twin.results.summary import Json
+from twin.results.contracts import (
+    ChannelError,
+    Jump,
+    ParameterEstimate,
+    Response,
+    RunSummary,
+    StepEntry,
+)
 from twin.results.twin_verdict import format_misfit
 
 RESPONSES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
@@ -22,146 +30,224 @@ BASE_UNITS = {
 MIN_CHANGE_SIGMA = 3.0  # standard deviations beyond which an estimate has changed
 
 
+Pair = list[float | None]  # value of the first and of the second run
+
+
 @dataclass(frozen=True, slots=True)
 class ComparedRun:
     """A run to compare: its folder, summary, and the flat parameters of its model in SI."""
 
     folder: Path
     recording: Recording
-    summary: Json
+    summary: RunSummary
     parameters: Mapping[str, float]
 
-
-def compare_summaries(first: ComparedRun, second: ComparedRun) -> Json:
-    """Return the comparison of two runs; pairs are (first, second), None where one has no value."""
-    runs = (first, second)
-    return {
-        "runs": [_describe_run(run) for run in runs],
-        "steps": _pair_steps(first.summary["steps"], second.summary["steps"]),
-        "jumps": {
-            source: _pair_jumps(*(run.summary.get(f"{prefix}jumps") or [] for run in runs))
-            for source, prefix in (("measured", ""), ("twin", "twin_"))
-        },
-        "misfit": {
-            channel: {
-                key: [_channel_error(run, channel, key) for run in runs]
-                for key in ("nrmse", "noise_floor")
-            }
-            for channel in dict.fromkeys(
-                name for run in runs for name in run.summary.get("comparison") or {}
-            )
-        },
-        "estimates": _pair_estimates(
-            *(run.summary.get("estimates") or {} for run in runs),
-            is_one_model=first.parameters == second.parameters,
-        ),
-        "model": [
-            {
-                "name": name,
-                "unit": find_parameter_unit(name),
-                "values": [_finite(run.parameters.get(name)) for run in runs],
-            }
-            for name in dict.fromkeys(name for run in runs for name in run.parameters)
-        ],
-    }
+    def find_error(self, channel: str) -> ChannelError:
+        """Return the error of the twin in a channel."""
+        return self.summary.comparison.get(channel, ChannelError())
 
 
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None
+@dataclass(frozen=True, slots=True)
+class RunOverview:
+    """What was run, when, and how it ended; None is what the summary does not state."""
+
+    folder: str
+    id: str | None
+    title: str | None
+    started_at: str | None
+    gap_m: float | None
+    model: str | None
+    verdict: str
+    twin_verdict: str | None
+    excitation_verdict: str | None
+    misfit: str
+    warnings: int
+    steps: int
 
 
-def _describe_run(run: ComparedRun) -> Json:
-    twin = run.summary.get("twin_verdict") or {}
-    info = run.summary["run"]
-    return {
-        "folder": str(run.folder),
-        **{key: info.get(key) for key in ("id", "title", "started_at", "gap_m", "model")},
-        "verdict": run.summary["verdict"],
-        "twin_verdict": twin.get("verdict"),
-        "excitation_verdict": (run.summary.get("excitation_verdict") or {}).get("verdict"),
-        "misfit": format_misfit(twin),
-        "warnings": len(run.summary.get("warnings") or ()),
-        "steps": len(run.summary["steps"]),
-    }
+@dataclass(frozen=True, slots=True)
+class StepPair:
+    """Responses by name at a step that both runs have: same direction and frequency."""
+
+    direction: str
+    frequency_hz: float
+    measured: dict[str, Pair]
+    twin: dict[str, Pair]
 
 
-def _pair_steps(first: Sequence[Json], second: Sequence[Json]) -> list[Json]:
-    """Return the responses of the steps that both runs have: same direction and frequency."""
-    others = {(step["direction"], round(step["frequency_hz"], 6)): step for step in second}
-    pairs = [
-        (step, other)
-        for step in first
-        if (other := others.get((step["direction"], round(step["frequency_hz"], 6))))
-    ]
-    return [
-        {
-            "direction": step["direction"],
-            "frequency_hz": step["frequency_hz"],
-            **{
-                source: {
-                    name: [(entry.get(source) or {}).get(name) for entry in (step, other)]
-                    for name in RESPONSES
-                }
-                for source in ("measured", "twin")
-            },
-        }
-        for step, other in pairs
-    ]
+@dataclass(frozen=True, slots=True)
+class JumpPair:
+    """Jump of one direction and kind in both runs; None where one lacks it."""
+
+    direction: str
+    kind: str
+    between_hz: list[list[float] | None]
+    shift_hz: float | None
 
 
-def _pair_jumps(first: Sequence[Json], second: Sequence[Json]) -> list[Json]:
-    """Return jumps of the same direction and kind in pairs, in order; None where one is alone."""
-    kinds = dict.fromkeys((jump["direction"], jump["kind"]) for jump in (*first, *second))
-    pairs = []
-    for direction, kind in kinds:
-        of_kind = [
-            [
-                [jump["from_hz"], jump["to_hz"]]
-                for jump in jumps
-                if (jump["direction"], jump["kind"]) == (direction, kind)
-            ]
-            for jumps in (first, second)
-        ]
-        for number in range(max(map(len, of_kind))):
-            places = [jumps[number] if number < len(jumps) else None for jumps in of_kind]
-            shift = 0.5 * (sum(places[1]) - sum(places[0])) if places[0] and places[1] else None
-            pairs.append(
-                {"direction": direction, "kind": kind, "between_hz": places, "shift_hz": shift}
-            )
-    return pairs
+@dataclass(frozen=True, slots=True)
+class MisfitPair:
+    """NRMSE of the restarted twin in a channel, and the part of noise."""
+
+    nrmse: Pair
+    noise_floor: Pair
 
 
-def _channel_error(run: ComparedRun, channel: str, key: str) -> float | None:
-    error = (run.summary.get("comparison") or {}).get(channel) or {}
-    return error.get(key)
-
-
-def _pair_estimates(
-    first: Mapping[str, Json], second: Mapping[str, Json], *, is_one_model: bool
-) -> list[Json]:
-    """Return the parameters estimated in both runs, their change and its standard deviations.
+@dataclass(frozen=True, slots=True)
+class EstimatePair:
+    """Parameter estimated in both runs, SI; its change also in standard deviations.
 
     An estimate holds beside the effects of its own model, so a change between two models is none of
     the specimen: it has no standard deviations.
     """
+
+    name: str
+    unit: str
+    values: list[float]
+    sd: list[float]
+    change: float
+    sigma: float | None
+    changed: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterPair:
+    """Parameter of the twin's model in SI."""
+
+    name: str
+    unit: str
+    values: Pair
+
+
+@dataclass(frozen=True, slots=True)
+class RunComparison:
+    """Comparison of two runs, the content of comparison.json; pairs are (first, second)."""
+
+    runs: list[RunOverview]
+    steps: list[StepPair]
+    jumps: dict[str, list[JumpPair]]
+    misfit: dict[str, MisfitPair]
+    estimates: list[EstimatePair]
+    model: list[ParameterPair]
+
+
+def compare_summaries(first: ComparedRun, second: ComparedRun) -> RunComparison:
+    """Return the comparison of two runs."""
+    runs = (first, second)
+    return RunComparison(
+        runs=[_describe_run(run) for run in runs],
+        steps=_pair_steps(first.summary.steps, second.summary.steps),
+        jumps={
+            "measured": _pair_jumps(first.summary.jumps, second.summary.jumps),
+            "twin": _pair_jumps(first.summary.twin_jumps, second.summary.twin_jumps),
+        },
+        misfit={
+            channel: MisfitPair(
+                [run.find_error(channel).nrmse for run in runs],
+                [run.find_error(channel).noise_floor for run in runs],
+            )
+            for channel in dict.fromkeys(name for run in runs for name in run.summary.comparison)
+        },
+        estimates=_pair_estimates(
+            first.summary.estimates,
+            second.summary.estimates,
+            is_one_model=first.parameters == second.parameters,
+        ),
+        model=[
+            ParameterPair(
+                name, find_parameter_unit(name), [run.parameters.get(name) for run in runs]
+            )
+            for name in dict.fromkeys(name for run in runs for name in run.parameters)
+        ],
+    )
+
+
+def _describe_run(run: ComparedRun) -> RunOverview:
+    summary, info = run.summary, run.summary.run
+    return RunOverview(
+        folder=str(run.folder),
+        id=info.id or None,
+        title=info.title or None,
+        started_at=info.started_at or None,
+        gap_m=info.gap_m,
+        model=info.model,
+        verdict=summary.verdict,
+        twin_verdict=summary.twin_verdict.verdict if summary.twin_verdict else None,
+        excitation_verdict=summary.excitation_verdict.verdict
+        if summary.excitation_verdict
+        else None,
+        misfit=format_misfit(summary.twin_verdict),
+        warnings=len(summary.warnings),
+        steps=len(summary.steps),
+    )
+
+
+def _pair_steps(first: Sequence[StepEntry], second: Sequence[StepEntry]) -> list[StepPair]:
+    """Return the responses of the steps that both runs have."""
+    others = {(step.direction, round(step.frequency_hz, 6)): step for step in second}
+    return [
+        StepPair(
+            step.direction,
+            step.frequency_hz,
+            _pair_responses(step.measured, other.measured),
+            _pair_responses(step.twin, other.twin),
+        )
+        for step in first
+        if (other := others.get((step.direction, round(step.frequency_hz, 6))))
+    ]
+
+
+def _pair_responses(first: Response | None, second: Response | None) -> dict[str, Pair]:
+    return {name: [getattr(entry, name, None) for entry in (first, second)] for name in RESPONSES}
+
+
+def _pair_jumps(first: Sequence[Jump], second: Sequence[Jump]) -> list[JumpPair]:
+    """Return jumps of the same direction and kind in pairs, in order."""
+    kinds = dict.fromkeys((jump.direction, jump.kind) for jump in (*first, *second))
+    return [
+        JumpPair(
+            direction,
+            kind,
+            [[jump.from_hz, jump.to_hz] if jump else None for jump in pair],
+            0.5 * (pair[1].from_hz + pair[1].to_hz - (pair[0].from_hz + pair[0].to_hz))
+            if pair[0] and pair[1]
+            else None,
+        )
+        for direction, kind in kinds
+        for pair in zip_longest(
+            *(
+                [jump for jump in jumps if (jump.direction, jump.kind) == (direction, kind)]
+                for jumps in (first, second)
+            )
+        )
+    ]
+
+
+def _pair_estimates(
+    first: Mapping[str, ParameterEstimate],
+    second: Mapping[str, ParameterEstimate],
+    *,
+    is_one_model: bool,
+) -> list[EstimatePair]:
+    """Return the parameters estimated in both runs."""
     pairs = []
-    for name in first:
+    for name, a in first.items():
         if name not in second:
             continue
-        a, b = first[name], second[name]
-        change = b["value"] - a["value"]
-        sd = math.hypot(a["sd"] or 0.0, b["sd"] or 0.0)
+        b = second[name]
+        change = b.value - a.value
+        sd = math.hypot(*(value for value in (a.sd, b.sd) if math.isfinite(value)))
         sigma = abs(change) / sd if sd and is_one_model else None
         pairs.append(
-            {
-                "name": name,
-                "unit": find_parameter_unit(name),
-                "values": [a["value"], b["value"]],
-                "sd": [a["sd"], b["sd"]],
-                "change": change,
-                "sigma": sigma,
-                "changed": sigma is not None and sigma > MIN_CHANGE_SIGMA,
-            }
+            EstimatePair(
+                name,
+                find_parameter_unit(name),
+                [a.value, b.value],
+                [a.sd, b.sd],
+                change,
+                sigma,
+                sigma is not None and sigma > MIN_CHANGE_SIGMA,
+            )
         )
     return pairs
 

@@ -23,17 +23,17 @@ from twin.drawing.prc_drawing import (
     make_prc_panels,
     plot_prc,
 )
-from twin.report.run_comparison import ComparedRun
+from twin.report.run_comparison import ComparedRun, RunComparison
 from twin.results.quantities import format_quantity
 from twin.results.report_data import DIRECTIONS, extract_prc
-from twin.results.summary import Json, parse_jumps, prc_points
+from twin.results.summary import prc_points
 from twin.results.twin_verdict import CHANNEL_SYMBOLS
 
 RUN_COLOURS = ("#c8741a", "#0f7b7b")  # first, second: neither is that of a direction
 
 
 def write_comparison_page(
-    folder: Path, first: ComparedRun, second: ComparedRun, comparison: Json
+    folder: Path, first: ComparedRun, second: ComparedRun, comparison: RunComparison
 ) -> Path:
     """Write compare.html and its figures into a folder; return the path of the page."""
     pictures = save_figures(draw_comparison(first, second), folder / "figures")
@@ -53,7 +53,7 @@ def write_comparison_page(
 
 def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures:
     """Draw the curves of two runs over each other: measured wide and pale, twin thin on top."""
-    points = [prc_points(run.summary["steps"]) for run in (first, second)]
+    points = [prc_points(run.summary.steps) for run in (first, second)]
     if not any(points):
         return
     has_bumpers = any(
@@ -69,8 +69,7 @@ def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures
     handles = []
     named_runs = zip((first, second), points, RUN_COLOURS, ("first", "second"), strict=True)
     for run, of_run, colour, name in named_runs:
-        for source in ("measured", "twin"):
-            jumps = parse_jumps(run.summary, source)
+        for source, jumps in (("measured", run.summary.jumps), ("twin", run.summary.twin_jumps)):
             curves = break_at_jumps(partial(extract_prc, of_run, source), jumps)
             plot_prc(panels, curves, partial(_run_style, colour, source))
             handles.append(

@@ -3,13 +3,13 @@
 import html
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 from table_io.errors import InputError
 from twin.recording.run_paths import PARTS_FOLDER
+from twin.results.contracts import ChannelError, RunSummary
 
 LOG_NAME = "run.mcap"
 # Below the folder itself: a run, a run of a campaign, and both in the default folder `runs`.
@@ -94,24 +94,29 @@ def index_runs(folder: Path) -> list[RunRow]:
 
 def _read_row(root: Path, folder: Path) -> RunRow:
     try:
-        summary: dict[str, Any] = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
-        info, twin = dict(summary["run"]), summary.get("twin_verdict") or {}
-        error = (summary.get("comparison") or {}).get("rel_disp_m") or {}
-        warnings = summary.get("warnings")
-        return RunRow(
-            str(folder.relative_to(root)), info.get("started_at"), info.get("name"),
-            info.get("title"), info.get("source"), info.get("gap_m"), summary.get("verdict"),
-            twin.get("verdict"), (summary.get("excitation_verdict") or {}).get("verdict"),
-            twin.get("misfit"), twin.get("misfit_worst"), error.get("nrmse"),
-            None if warnings is None else len(warnings), summary.get("gaps"), info.get("model"),
-        )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError):
+        summary = RunSummary.read(folder / "summary.json", "")
+    except InputError:
         return RunRow(str(folder.relative_to(root)), *[None] * 14)
-
-
-def rows_to_json(rows: Iterable[RunRow]) -> list[dict[str, Any]]:
-    """Return the rows as JSON objects."""
-    return [asdict(row) for row in rows]
+    info, twin, stated = summary.run, summary.twin_verdict, summary.model_fields_set
+    return RunRow(
+        folder=str(folder.relative_to(root)),
+        started_at=info.started_at or None,
+        test=info.name or None,
+        title=info.title or None,
+        source=info.source or None,
+        gap_m=info.gap_m,
+        verdict=summary.verdict,
+        twin_verdict=twin.verdict if twin else None,
+        excitation_verdict=summary.excitation_verdict.verdict
+        if summary.excitation_verdict
+        else None,
+        misfit=twin.misfit if twin else None,
+        misfit_worst=twin.misfit_worst if twin else None,
+        nrmse=summary.comparison.get("rel_disp_m", ChannelError()).nrmse,
+        warnings=len(summary.warnings) if "warnings" in stated else None,
+        dropouts=summary.gaps if "gaps" in stated else None,
+        model=info.model,
+    )
 
 
 def write_run_index(rows: Iterable[RunRow], page: Path, root: Path) -> None:

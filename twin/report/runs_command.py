@@ -1,5 +1,6 @@
 """`runs`: table, JSON or index page of the runs in a folder."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 from rich.table import Table
@@ -7,8 +8,8 @@ from rich.text import Text
 
 from table_io.errors import InputError, replace_escapes
 from twin.report.finalize import VERDICT_COLOURS
-from twin.report.run_index import RunRow, index_runs, rows_to_json
-from twin.results.summary import dump_strict_json
+from twin.report.run_index import RunRow, index_runs
+from twin.results.contract import format_json
 from twin.system.terminal import console, print_line, print_table
 
 COLOURS = VERDICT_COLOURS | {"complete": "green", "stopped": "yellow"}
@@ -24,7 +25,7 @@ def print_runs(folder: Path, as_json: bool, page: Path | None) -> None:
 
         write_run_index(rows, page, folder)
     if as_json:
-        print(dump_strict_json({"runs": rows_to_json(rows)}))
+        print(format_json({"runs": [asdict(row) for row in rows]}))
         return
     if rows:
         print_table(console, _make_table(rows))

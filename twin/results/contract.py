@@ -5,9 +5,22 @@ A number that is not finite is null in a file, as JSON has no NaN.
 
 import json
 import math
-from typing import Annotated, Any
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSerializer
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+)
+
+from table_io.errors import InputError
+
+Json = dict[str, Any]
 
 
 def declare_unit(unit: str) -> Any:
@@ -32,15 +45,21 @@ Real = Annotated[
     PlainSerializer(_drop_nonfinite, return_type=float | None),
 ]
 Ratio = Annotated[Number, declare_unit("1")]
+RealRatio = Annotated[Real, declare_unit("1")]
 Metres = Annotated[Number, declare_unit("m")]
+RealMetres = Annotated[Real, declare_unit("m")]
 Acceleration = Annotated[Number, declare_unit("m/s2")]
+RealAcceleration = Annotated[Real, declare_unit("m/s2")]
 Seconds = Annotated[float, declare_unit("s")]
+RealSeconds = Annotated[Real, declare_unit("s")]
 Milliseconds = Annotated[Number, declare_unit("ms")]
 Minutes = Annotated[float, declare_unit("min")]
 Hertz = Annotated[float, declare_unit("Hz")]
-Degrees = Annotated[Number, declare_unit("deg")]
+RealHertz = Annotated[Real, declare_unit("Hz")]
+RealDegrees = Annotated[Real, declare_unit("deg")]
 Index = Annotated[int, declare_unit("sample")]
 SI = Annotated[Number, declare_unit("SI unit of the quantity")]
+RealSI = Annotated[Real, declare_unit("SI unit of the quantity")]
 
 
 class Contract(BaseModel):
@@ -54,7 +73,48 @@ class Contract(BaseModel):
 
     def to_json(self) -> str:
         """Return the text of the file."""
-        return json.dumps(self.to_plain(), indent=1, allow_nan=False)
+        return format_json(self.to_plain())
+
+    def write(self, path: Path) -> None:
+        """Write the file."""
+        path.write_text(self.to_json() + "\n", encoding="utf-8")
+
+    @classmethod
+    def read(cls, path: Path, remedy: str) -> Self:
+        """Return the content of a file, of another version too: unknown keys are ignored.
+
+        InputError if the file is missing or breaks the contract.
+        """
+        try:
+            return cls.model_validate(json.loads(path.read_text(encoding="utf-8")), extra="ignore")
+        except FileNotFoundError:
+            raise InputError("file not found", where=path, remedy=remedy) from None
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(map(str, first["loc"]))
+            raise InputError(first["msg"], where=path, key=key, remedy=remedy) from None
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"cannot read the summary: {error}", where=path, remedy=remedy
+            ) from None
+
+
+def format_json(content: Mapping[str, Any]) -> str:
+    """Return strict JSON text; non-finite numbers become null."""
+    return json.dumps(_replace_nonfinite(content), indent=1, allow_nan=False)
+
+
+def write_json(content: Mapping[str, Any], path: Path) -> None:
+    """Write strict JSON; non-finite numbers become null."""
+    path.write_text(format_json(content) + "\n", encoding="utf-8")
+
+
+def _replace_nonfinite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _replace_nonfinite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_replace_nonfinite(item) for item in value]
+    return _drop_nonfinite(value)
 
 
 def build_json_schema(contract: type[BaseModel]) -> dict[str, Any]:

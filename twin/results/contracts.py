@@ -1,48 +1,58 @@
-"""Contract of summary.json: each key, its meaning and its unit.
+"""Result of a run as classes: what is computed, drawn and printed, and the content of summary.json.
 
-The writer accepts nothing else (`twin.results.summary.dump_contract`).
+Each key, its meaning and its unit is written here only; the order is that of the file. A key with a
+default may be absent in the file of an older version.
 """
 
+import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
 from twin.results.contract import (
     SI,
     Acceleration,
     Contract,
-    Degrees,
     Hertz,
     Index,
     Metres,
     Milliseconds,
     Number,
     Ratio,
+    RealAcceleration,
+    RealDegrees,
+    RealHertz,
+    RealMetres,
+    RealRatio,
+    RealSeconds,
+    RealSI,
     Seconds,
 )
 
 Direction = Literal["forward", "backward"]
+Phase = Literal["flight", "contact_right", "contact_left", ""]
+NOTHING_MEASURED = "nothing was measured that the twin predicts"  # reason of a verdict
 
 
 class RunInfo(Contract):
     """Origin and length of a recording."""
 
-    id: str = Field(description="unique name of the run")
-    name: str = Field(description="name of its profile")
-    title: str = Field(description="title in the profile")
-    source: str = Field(description="origin of the measured samples: table or model")
-    started_at: str = Field(description="local time, ISO 8601")
-    host: str = Field(description="computer that recorded it")
-    rate_hz: Hertz = Field(description="sampling rate")
-    samples: Index = Field(description="length in samples")
-    duration_s: Seconds = Field(description="length in time")
-    normalisation: str = Field(description="how u* and a* are found")
-    gap_m: Metres = Field(
-        None, description="nominal total gap; null without bumpers and in old files"
+    id: str = Field("", description="unique name of the run")
+    name: str = Field("", description="name of its profile")
+    title: str = Field("", description="title in the profile")
+    source: str = Field("", description="origin of the measured samples: table or model")
+    started_at: str = Field("", description="local time, ISO 8601")
+    host: str = Field("", description="computer that recorded it")
+    rate_hz: RealHertz = Field(math.nan, description="sampling rate")
+    samples: Index = Field(0, description="length in samples")
+    duration_s: RealSeconds = Field(math.nan, description="length in time")
+    gap_m: Metres = Field(None, description="nominal total gap; null without bumpers")
+    model: str | None = Field(None, description="title of the twin's model")
+    normalisation: str = Field("", description="how u* and a* are found")
+    branches_from: str = Field(
+        "measured", description="source of `jumps` and `hysteresis`: measured or twin"
     )
-    model: str | None = Field(None, description="title of the twin's model; null in old files")
-    branches_from: str = Field(description="source of `jumps` and `hysteresis`: measured or twin")
 
 
 class Response(Contract):
@@ -52,28 +62,38 @@ class Response(Contract):
     the same where every cycle is alike and more where they differ.
     """
 
-    eta_d: Ratio = Field(description="half range of u over u*")
-    eta_a: Ratio = Field(description="half range of the total acceleration of the mass over a*")
-    eta_r: Ratio = Field(description="deformation of the right bumper over u*")
-    eta_l: Ratio = Field(description="deformation of the left bumper over u*")
-    r_r: Ratio = Field(description="force of the right bumper over the weight of the mass")
-    r_l: Ratio = Field(description="force of the left bumper over the weight of the mass")
-    impacts_right: list[int] = Field(description="impacts on the right bumper in each cycle")
-    impacts_left: list[int] = Field(description="impacts on the left bumper in each cycle")
-    drift: Ratio = Field(description="change of eta_d over the measured cycles, of its mean")
-    spread: Ratio = Field(description="range of eta_d over the measured cycles, of its mean")
-    spread_a: Ratio = Field(
-        None, description="range of eta_a over the measured cycles, of its mean; null in old files"
+    eta_d: RealRatio = Field(math.nan, description="half range of u over u*")
+    eta_a: RealRatio = Field(
+        math.nan, description="half range of the total acceleration of the mass over a*"
+    )
+    eta_r: RealRatio = Field(math.nan, description="deformation of the right bumper over u*")
+    eta_l: RealRatio = Field(math.nan, description="deformation of the left bumper over u*")
+    r_r: RealRatio = Field(
+        math.nan, description="force of the right bumper over the weight of the mass"
+    )
+    r_l: RealRatio = Field(
+        math.nan, description="force of the left bumper over the weight of the mass"
+    )
+    impacts_right: list[int] = Field([], description="impacts on the right bumper in each cycle")
+    impacts_left: list[int] = Field([], description="impacts on the left bumper in each cycle")
+    drift: RealRatio = Field(
+        math.nan, description="change of eta_d over the measured cycles, of its mean"
+    )
+    spread: RealRatio = Field(
+        math.nan, description="range of eta_d over the measured cycles, of its mean"
+    )
+    spread_a: RealRatio = Field(
+        math.nan, description="range of eta_a over the measured cycles, of its mean"
     )
 
 
 class LevelResult(Contract):
     """Amplitude control at a step."""
 
-    demanded_m_s2: Acceleration = Field(description="demanded fundamental of the table")
-    error: Ratio = Field(description="relative error of the measured fundamental")
-    error_uncorrected: Ratio = Field(description="the same without the correction")
-    correction: Ratio = Field(description="factor on the command")
+    demanded_m_s2: RealAcceleration = Field(description="demanded fundamental of the table")
+    error: RealRatio = Field(description="relative error of the measured fundamental")
+    error_uncorrected: RealRatio = Field(description="the same without the correction")
+    correction: RealRatio = Field(description="factor on the command")
     updates: int = Field(description="changes of the correction at this step")
     accepted: bool = Field(description="whether the correction was frozen for the measured cycles")
 
@@ -81,59 +101,51 @@ class LevelResult(Contract):
 class StepMisfit(Contract):
     """Error of the restarted twin in a channel at a step: of the median of its held cycles."""
 
-    error: SI = Field(description="rms of measured minus twin")
-    band: SI = Field(description="tolerance, see `TwinVerdict.tolerance`")
+    error: RealSI = Field(description="rms of measured minus twin")
+    band: RealSI = Field(description="tolerance, see `TwinVerdict.tolerance`")
     misfit: Ratio = Field(description="error over the noise at rest; null if that is unknown")
-    phase: Literal["flight", "contact_right", "contact_left", ""] = Field(
-        description="phase with the largest error; empty if unknown"
-    )
+    phase: Phase = Field(description="phase with the largest error; empty if unknown")
+
+    @property
+    def share(self) -> float:
+        """Error over band: beyond 1 it is outside the tolerance."""
+        return self.error / self.band
 
 
 class StepBranch(Contract):
     """Whether the free-running twin is on the branch of the specimen at a step."""
 
     is_same: bool = Field(description="eta_d and phase are those of the specimen")
-    share: Ratio = Field(description="difference of eta_d over its tolerance")
+    share: RealRatio = Field(description="difference of eta_d over its tolerance")
     free_error: Ratio = Field(description="rms error of u over the rms of u; null if unknown")
 
 
-class StepKey(BaseModel):
-    """Keys that a step has in every file, old ones too; it may have more."""
+class StepEntry(Contract):
+    """Results of a step."""
 
     index: int = Field(description="number of the step in the test, from 0")
     direction: Direction = Field(description="direction of the sweep")
     frequency_hz: Hertz = Field(description="frequency of the step")
-
-
-class StepEntry(StepKey, Contract):
-    """Results of a step."""
-
-    measured: Response | None = Field(description="null without a measurement")
-    twin: Response | None = Field(description="null without a twin")
-    table_acc_peak_m_s2: Acceleration = Field(description="peak of the table acceleration")
-    table_acc_fundamental_m_s2: Acceleration = Field(description="its fundamental amplitude")
-    thd: Ratio = Field(description="its total harmonic distortion")
-    demanded_m_s2: Acceleration = Field(
-        None, description="demanded fundamental of the table; absent in old files"
+    measured: Response | None = Field(None, description="null without a measurement")
+    twin: Response | None = Field(None, description="null without a twin")
+    table_acc_peak_m_s2: RealAcceleration = Field(
+        math.nan, description="peak of the table acceleration"
     )
-    agreement: dict[str, StepMisfit] | None = Field(
-        None, description="of the restarted twin by channel; absent without a comparison"
+    table_acc_fundamental_m_s2: RealAcceleration = Field(
+        math.nan, description="its fundamental amplitude"
+    )
+    thd: RealRatio = Field(math.nan, description="its total harmonic distortion")
+    demanded_m_s2: RealAcceleration = Field(
+        math.nan, description="demanded fundamental of the table"
+    )
+    agreement: dict[str, StepMisfit] = Field(
+        {}, description="of the restarted twin by channel; absent without a comparison"
     )
     branch: StepBranch | None = Field(
         None, description="of the free-running twin; absent without a comparison"
     )
-
-
-class PlannedStep(StepEntry):
-    """Results of a step of the sweep."""
-
     level: LevelResult | None = Field(None, description="absent without amplitude control")
-
-
-class AddedStep(StepEntry):
-    """Results of a step that an adaptive policy added."""
-
-    reason: str = Field(description="why it was added")
+    reason: str = Field("", description="why an adaptive policy added it; absent for others")
 
 
 class Jump(Contract):
@@ -147,16 +159,20 @@ class Jump(Contract):
     )
 
 
-class WorstMisfit(StepMisfit):
+class WorstMisfit(Contract):
     """Step and channel with the largest error over band; without a step of a whole history."""
 
-    step: int | None = Field(description="number of the step")
-    direction: Direction | None = Field(description="its direction")
-    frequency_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+    step: int | None = Field(None, description="number of the step")
+    direction: Direction | None = Field(None, description="its direction")
+    frequency_hz: Number = Field(
+        None, description="its frequency", json_schema_extra={"unit": "Hz"}
+    )
     channel: str = Field(description="channel that departs most")
-    share: Ratio = Field(description="error over band; beyond 1 it is outside the tolerance")
-    error: SI = Field(description="rms of measured minus twin; null for a whole history")
-    band: SI = Field(description="tolerance; null for a whole history")
+    share: RealRatio = Field(description="error over band; beyond 1 it is outside the tolerance")
+    error: SI = Field(None, description="rms of measured minus twin; null for a whole history")
+    band: SI = Field(None, description="tolerance; null for a whole history")
+    misfit: Ratio = Field(description="error over the noise at rest; null if that is unknown")
+    phase: Phase = Field("", description="phase with the largest error; empty if unknown")
 
 
 class WorstBranch(Contract):
@@ -165,9 +181,15 @@ class WorstBranch(Contract):
     step: int = Field(description="number of the step")
     direction: Direction = Field(description="its direction")
     frequency_hz: Hertz = Field(description="its frequency")
-    measured: Ratio = Field(description="eta_d of the specimen")
-    twin: Ratio = Field(description="eta_d of the twin")
+    measured: RealRatio = Field(description="eta_d of the specimen")
+    twin: RealRatio = Field(description="eta_d of the twin")
     free_error: Ratio = Field(description="rms error of u over the rms of u; null if unknown")
+
+    @property
+    def departure(self) -> float:
+        """How far the two eta_d are apart, as a ratio of at least 1."""
+        low, high = sorted((self.measured, self.twin))
+        return high / low if low > 0 else math.inf
 
 
 class ExcitationVerdict(Contract):
@@ -255,27 +277,34 @@ class TripEntry(Contract):
 class PeakAndRms(Contract):
     """Peak and rms over a window; null without known samples."""
 
-    peak: SI = Field(description="largest magnitude")
-    rms: SI = Field(description="root mean square")
+    peak: SI = Field(None, description="largest magnitude")
+    rms: SI = Field(None, description="root mean square")
 
 
 class MotionResult(Contract):
     """Motion and contact of the specimen over a window."""
 
-    u: PeakAndRms = Field(description="relative displacement in m")
-    a: PeakAndRms = Field(description="total acceleration of the mass in m/s2")
-    force_r: PeakAndRms = Field(description="force of the right bumper in N")
-    force_l: PeakAndRms = Field(description="force of the left bumper in N")
-    impacts_right: int | None = Field(description="contacts that begin on the right")
-    impacts_left: int | None = Field(description="contacts that begin on the left")
+    u: PeakAndRms = Field(PeakAndRms(), description="relative displacement in m")
+    a: PeakAndRms = Field(PeakAndRms(), description="total acceleration of the mass in m/s2")
+    force_r: PeakAndRms = Field(PeakAndRms(), description="force of the right bumper in N")
+    force_l: PeakAndRms = Field(PeakAndRms(), description="force of the left bumper in N")
+    impacts_right: int | None = Field(None, description="contacts that begin on the right")
+    impacts_left: int | None = Field(None, description="contacts that begin on the left")
 
 
 class ChannelError(Contract):
     """Errors of the twin in a channel; null where there is nothing to compare."""
 
-    nrmse: Ratio = Field(description="of the twin restarted from the measured state")
-    free_nrmse: Ratio = Field(description="of the free-running twin")
+    nrmse: Ratio = Field(None, description="of the twin restarted from the measured state")
+    free_nrmse: Ratio = Field(None, description="of the free-running twin")
     noise_floor: Ratio = Field(None, description="what the noise of the sensors alone would leave")
+
+    @property
+    def noise_multiple(self) -> float | None:
+        """Error of the restarted twin in multiples of the noise; None if either is unknown."""
+        return (
+            self.nrmse / self.noise_floor if self.nrmse is not None and self.noise_floor else None
+        )
 
 
 class WindowResult(Contract):
@@ -284,11 +313,11 @@ class WindowResult(Contract):
     index: int = Field(description="number of the window")
     from_s: Seconds = Field(description="begin")
     to_s: Seconds = Field(description="end")
-    table_disp: PeakAndRms = Field(description="table displacement in m")
-    table_acc: PeakAndRms = Field(description="table acceleration in m/s2")
-    measured: MotionResult | None = Field(description="null without a measurement")
-    twin: MotionResult | None = Field(description="null without a twin")
-    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
+    table_disp: PeakAndRms = Field(PeakAndRms(), description="table displacement in m")
+    table_acc: PeakAndRms = Field(PeakAndRms(), description="table acceleration in m/s2")
+    measured: MotionResult | None = Field(None, description="null without a measurement")
+    twin: MotionResult | None = Field(None, description="null without a twin")
+    comparison: dict[str, ChannelError] = Field({}, description="errors of the twin by channel")
 
 
 class RequiredSpectrumResult(Contract):
@@ -305,52 +334,60 @@ class RequiredSpectrumResult(Contract):
     passed: bool = Field(description="whether every ordinate is allowed")
 
 
-class TrackingResult(Contract):
-    """Motion of the table against the displacement history that it should follow.
+class TrackingError(Contract):
+    """Motion of the table against its target; a perfect table has errors 0 and ratios 1.
 
-    See `twin.results.tracking`; the criteria are those of Chen et al. (2018). The lag is taken out
-    first. In the band, of spectra and of energy null if samples are lost.
+    See `twin.results.tracking`; the criteria are those of Chen et al. (2018). The lag, positive if
+    the table is late, is taken out first. Null is what cannot be had: without a displacement, and
+    in the band, of spectra and of energy if samples are lost.
     """
 
-    from_s: Seconds = Field(description="begin of the history")
-    to_s: Seconds = Field(description="end of the part that was played")
-    band_hz: Annotated[list[Hertz], Field(min_length=2, max_length=2)] = Field(
+    band_hz: tuple[Hertz, Hertz] = Field(
         description="band of interest, as in the profile or from the energy of the target"
     )
-    damping: Ratio = Field(description="ratio, of the response spectra")
-    lag_s: Seconds = Field(description="of the table behind its target")
-    acc_rms_error_band: Ratio = Field(
+    damping: RealRatio = Field(description="ratio, of the response spectra")
+    lag_s: RealSeconds = Field(description="of the table behind its target")
+    acc_rms_error_band: RealRatio = Field(
         description="rms error of the acceleration in the band, of the rms of the target there"
     )
-    acc_rms_error_full: Ratio = Field(description="the same at all frequencies")
-    pga_ratio_band: Ratio = Field(description="peak acceleration in the band, achieved over target")
-    pga_ratio_full: Ratio = Field(description="the same at all frequencies")
-    sa_share: Ratio = Field(
+    acc_rms_error_full: RealRatio = Field(description="the same at all frequencies")
+    pga_ratio_band: RealRatio = Field(
+        description="peak acceleration in the band, achieved over target"
+    )
+    pga_ratio_full: RealRatio = Field(description="the same at all frequencies")
+    sa_share: RealRatio = Field(
         description="share of the ordinates of the 1/6-octave response spectrum in the band that "
         "are within 10 % of the target"
     )
     sa_count: int = Field(description="ordinates of it")
-    sa_worst_ratio: Ratio = Field(description="ordinate farthest from the target, over it")
-    sa_worst_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
-    sa_fine_share: Ratio = Field(description="as `sa_share`, at 1/72 octave")
-    arias_ratio: Ratio = Field(description="Arias intensity, achieved over target")
-    cav_ratio: Ratio = Field(description="cumulative absolute velocity, achieved over target")
-    disp_rms_error_band: Ratio = Field(
+    sa_worst_ratio: RealRatio = Field(description="ordinate farthest from the target, over it")
+    sa_worst_hz: RealHertz = Field(description="its frequency")
+    sa_fine_share: RealRatio = Field(description="as `sa_share`, at 1/72 octave")
+    arias_ratio: RealRatio = Field(description="Arias intensity, achieved over target")
+    cav_ratio: RealRatio = Field(description="cumulative absolute velocity, achieved over target")
+    disp_rms_error_band: RealRatio = Field(
         description="rms error of the displacement in the band, of the rms of the target there"
     )
-    disp_rms_error_full: Ratio = Field(description="the same at all frequencies")
+    disp_rms_error_full: RealRatio = Field(description="the same at all frequencies")
     lost_samples: Index = Field(description="samples of the acceleration that are missing")
+
+
+class TrackingResult(TrackingError):
+    """Motion of the table against the displacement history that it should follow."""
+
+    from_s: Seconds = Field(description="begin of the history")
+    to_s: Seconds = Field(description="end of the part that was played")
     required_spectrum: RequiredSpectrumResult | None = Field(
         description="null without one in the profile"
     )
 
 
-class PlannedOrbitKeys(Contract):
+class PlannedOrbitEntry(Contract):
     """Orbit of the twin at a planned point."""
 
     frequency_hz: Hertz = Field(description="its frequency")
-    amplitude_m: Metres = Field(description="half of max u - min u")
-    multiplier: Ratio = Field(description="magnitude of its largest Floquet multiplier")
+    amplitude_m: RealMetres = Field(description="half of max u - min u")
+    multiplier: RealRatio = Field(description="magnitude of its largest Floquet multiplier")
 
 
 class OrbitResult(Contract):
@@ -358,22 +395,22 @@ class OrbitResult(Contract):
 
     index: int = Field(description="planned point")
     frequency_hz: Hertz = Field(description="frequency")
-    acceleration_m_s2: Acceleration = Field(description="fundamental of the table, measured")
-    amplitude_m: Metres = Field(description="half of max u - min u")
-    fundamental_m: Metres = Field(description="fundamental of u")
-    phase_deg: Degrees = Field(description="its lead over that of the table's acceleration")
-    feedback_m: Metres = Field(description="root of the sum of squares of its harmonics")
-    feedback_share: Ratio = Field(description="the same over the amplitude of the command")
-    feedback_harmonics_m: list[Metres] = Field(description="amplitudes of harmonics 0, 1, ...")
-    noise_m: Metres = Field(description="part of `feedback_m` that sensor noise explains")
+    acceleration_m_s2: RealAcceleration = Field(description="fundamental of the table, measured")
+    amplitude_m: RealMetres = Field(description="half of max u - min u")
+    fundamental_m: RealMetres = Field(description="fundamental of u")
+    phase_deg: RealDegrees = Field(description="its lead over that of the table's acceleration")
+    feedback_m: RealMetres = Field(description="root of the sum of squares of its harmonics")
+    feedback_share: RealRatio = Field(description="the same over the amplitude of the command")
+    feedback_harmonics_m: list[RealMetres] = Field(description="amplitudes of harmonics 0, 1, ...")
+    noise_m: RealMetres = Field(description="part of `feedback_m` that sensor noise explains")
     periods: int = Field(description="since the change of point")
     updates: int = Field(description="changes of the reference")
     accepted: bool = Field(description="the feedback has vanished, on the sought branch")
     reason: str = Field(description="why it is not accepted; empty if it is")
     stable: bool = Field(description="without feedback, by the plan")
-    multiplier: Ratio = Field(description="measured Floquet multiplier; null if it was not")
+    multiplier: RealRatio = Field(description="measured Floquet multiplier; null if it was not")
     multiplier_sd: Ratio | None = Field(description="its standard deviation; null without one")
-    planned: PlannedOrbitKeys = Field(description="orbit of the twin")
+    planned: PlannedOrbitEntry = Field(description="orbit of the twin")
 
 
 class MeasuredFold(Contract):
@@ -381,16 +418,16 @@ class MeasuredFold(Contract):
 
     kind: Literal["lower", "upper"] = Field(description="whether the branch turns up or down there")
     frequency_hz: Hertz = Field(description="where the branch turns")
-    amplitude_m: Metres = Field(description="half of max u - min u there")
+    amplitude_m: RealMetres = Field(description="half of max u - min u there")
     orbits: int = Field(description="measured orbits that the parabola is fitted to")
 
 
 class Latency(Contract):
     """Latency of the twin: scheduled last sample of a block to its published Comparison."""
 
-    p50: Milliseconds = Field(description="median")
-    p99: Milliseconds = Field(description="99th percentile")
-    max: Milliseconds = Field(description="largest")
+    p50: Milliseconds = Field(None, description="median")
+    p99: Milliseconds = Field(None, description="99th percentile")
+    max: Milliseconds = Field(None, description="largest")
 
 
 class ComponentTiming(Contract):
@@ -409,18 +446,18 @@ class ComponentTiming(Contract):
 class TimingResult(Contract):
     """Timing of a run; null where nothing was timed."""
 
-    latency_ms: Latency = Field(description="latency of the twin")
-    missed_deadlines: int | None = Field(description="of all components")
-    components: dict[str, ComponentTiming] = Field(description="timing of each component")
+    latency_ms: Latency = Field(Latency(), description="latency of the twin")
+    missed_deadlines: int | None = Field(None, description="of all components")
+    components: dict[str, ComponentTiming] = Field({}, description="timing of each component")
 
 
 class ParameterEstimate(Contract):
     """Last estimate of a parameter by the condition monitoring, SI."""
 
-    value: SI = Field(description="estimate")
-    sd: SI = Field(description="its standard deviation")
-    drift: SI = Field(description="change since the first estimate")
-    drift_sd: SI = Field(description="standard deviation of the drift")
+    value: RealSI = Field(description="estimate")
+    sd: RealSI = Field(description="its standard deviation")
+    drift: RealSI = Field(description="change since the first estimate")
+    drift_sd: RealSI = Field(description="standard deviation of the drift")
 
 
 class WarningEntry(Contract):
@@ -473,34 +510,29 @@ class ReplayResult(Contract):
     recorded_comparison: dict[str, ChannelError] = Field(description="errors as recorded")
 
 
-class SummaryKeys(BaseModel):
-    """Keys that every summary.json of a run has, old ones too; it may have more."""
-
-    run: BaseModel = Field(description="origin and length of the recording")
-    verdict: str = Field(description="how the test ended: complete, stopped, aborted or halted")
-    steps: Sequence[StepKey] = Field(description="planned steps that were measured, in order")
-
-
-class RunSummary(SummaryKeys, Contract):
+class RunSummary(Contract):
     """summary.json of a run, a replay or a simulation."""
 
     run: RunInfo = Field(description="origin and length of the recording")
-    steps: list[PlannedStep] = Field(description="planned steps that were measured, in order")
-    planned_steps: int | None = Field(None, description="of the sweep; absent in old files")
-    reason: str = Field(description="why the test ended")
-    gaps: int = Field(description="gaps in the recording")
-    lost_samples: Index = Field(description="samples missing in the file")
+    verdict: str = Field(description="how the test ended: complete, stopped, aborted or halted")
+    reason: str = Field("", description="why the test ended")
+    gaps: int = Field(0, description="gaps in the recording")
+    lost_samples: Index = Field(0, description="samples missing in the file")
     clipped_channels: list[str] = Field(
         [], description="of the motion, with samples off the range of the sensor"
     )
-    clipped_steps: list[Index] = Field(
-        [], description="with a sensor of the motion off its range; absent in old files"
+    clipped_steps: list[Index] = Field([], description="with a sensor of the motion off its range")
+    faults: list[FaultEntry] = Field([], description="failures of components")
+    u_star_m: Metres = Field(
+        None, description="u* that normalizes displacements; null without steps"
     )
-    faults: list[FaultEntry] = Field(description="failures of components")
-    u_star_m: Metres = Field(description="u* that normalizes displacements; null without steps")
-    a_star_m_s2: Acceleration = Field(description="a* that normalizes accelerations")
-    checks: list[CheckEntry] = Field(description="loop check")
-    trips: list[TripEntry] = Field(description="trips of the protection")
+    a_star_m_s2: Acceleration = Field(
+        None, description="a* that normalizes accelerations; null without steps"
+    )
+    checks: list[CheckEntry] = Field([], description="loop check")
+    trips: list[TripEntry] = Field([], description="trips of the protection")
+    planned_steps: int = Field(0, description="of the sweep")
+    steps: Sequence[StepEntry] = Field(description="planned steps that were measured, in order")
     windows: list[WindowResult] | None = Field(
         None, description="of a displacement history; absent for a stepped sine"
     )
@@ -510,24 +542,43 @@ class RunSummary(SummaryKeys, Contract):
     orbits: list[OrbitResult] | None = Field(
         None, description="of a continuation, in order of measurement; absent otherwise"
     )
-    folds: list[MeasuredFold] | None = Field(
-        None, description="of the branch of a continuation; absent otherwise and in old files"
+    folds: list[MeasuredFold] = Field(
+        [], description="of the branch of a continuation; absent otherwise"
     )
-    visits: list[AddedStep] = Field(description="steps added during the test, not in the PRC")
-    findings: list[str] = Field(alias="found", description="of the adaptive policies")
-    jumps: list[Jump] = Field(description="jumps of `run.branches_from`")
-    hysteresis: list[HysteresisInterval] = Field(description="hysteresis of `run.branches_from`")
-    twin_jumps: list[Jump] = Field(description="jumps of the twin")
-    twin_hysteresis: list[HysteresisInterval] = Field(description="hysteresis of the twin")
-    timing: TimingResult = Field(description="latencies")
-    comparison: dict[str, ChannelError] = Field(description="errors of the twin by channel")
-    estimates: dict[str, ParameterEstimate] = Field(description="by parameter")
-    warnings: list[WarningEntry] = Field(description="warnings of the condition monitoring")
+    visits: list[StepEntry] = Field([], description="steps added during the test, not in the PRC")
+    findings: list[str] = Field([], alias="found", description="of the adaptive policies")
+    jumps: list[Jump] = Field([], description="jumps of `run.branches_from`")
+    hysteresis: list[HysteresisInterval] = Field(
+        [], description="hysteresis of `run.branches_from`"
+    )
+    twin_jumps: list[Jump] = Field([], description="jumps of the twin")
+    twin_hysteresis: list[HysteresisInterval] = Field([], description="hysteresis of the twin")
+    timing: TimingResult = Field(TimingResult(), description="latencies")
+    comparison: dict[str, ChannelError] = Field({}, description="errors of the twin by channel")
+    estimates: dict[str, ParameterEstimate] = Field({}, description="by parameter")
+    warnings: list[WarningEntry] = Field([], description="warnings of the condition monitoring")
     excitation_verdict: ExcitationVerdict | None = Field(
-        None, description="whether the table played the test; absent in old files"
+        None, description="whether the table played the test"
     )
     twin_verdict: TwinVerdict | None = Field(
-        None, description="on the twin, apart from `verdict` on the test; absent in old files"
+        None, description="on the twin, apart from `verdict` on the test"
     )
     replay: ReplayResult | None = Field(None, description="absent unless it is a replay")
     sha256: str | None = Field(None, description="hash of run.mcap; only in a campaign")
+
+    @property
+    def stars(self) -> tuple[float, float] | None:
+        """u* in m and a* in m/s2 that normalize the steps; None without steps."""
+        if self.u_star_m is None or self.a_star_m_s2 is None:
+            return None
+        return self.u_star_m, self.a_star_m_s2
+
+    @property
+    def has_dropouts(self) -> bool:
+        """Whether samples are missing in the recording."""
+        return bool(self.gaps)
+
+    @property
+    def is_twin_judged(self) -> bool:
+        """Whether anything was measured that the twin predicts."""
+        return self.twin_verdict is not None and self.twin_verdict.reason != NOTHING_MEASURED

@@ -7,54 +7,58 @@ required spectrum is met.
 """
 
 import math
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 from table_io.config.profile import Profile
+from twin.results.contracts import ExcitationVerdict, RunSummary, StepEntry, TrackingResult
 
-Json = dict[str, Any]
 # Of the rms of the target's acceleration, in the band that is judged: beyond it the table has
 # played another record, whatever its peak.
 MAX_RECORD_ERROR = 0.3
 
 
-def judge_excitation(summary: Mapping[str, Any], profile: Profile) -> Json:
-    """Return the entry `excitation_verdict` of a summary, from its other entries."""
-    if (summary.get("run") or {}).get("source") == "model":
-        return _state("not judged", "no table was driven")
-    if summary.get("tracking"):
-        return _judge_record(summary["tracking"], profile)
-    known = list_level_errors(summary["steps"])
+def judge_excitation(summary: RunSummary, profile: Profile) -> ExcitationVerdict:
+    """Return the verdict on the excitation of a run, from its other results."""
+    if summary.run.source == "model":
+        return _decline("no table was driven")
+    if summary.tracking:
+        return _judge_record(summary.tracking, profile)
+    known = list_level_errors(summary.steps)
     if not known:
-        return _state("not judged", "the level of no step is known")
+        return _decline("the level of no step is known")
     tolerance = profile.protection.alarm
     error, step = max(known, key=lambda entry: abs(entry[0]))
     outside = sum(abs(error) > tolerance for error, _ in known)
-    place = f"{100 * error:+.2g} % at {step['frequency_hz']:g} Hz {step['direction']}"
+    place = f"{100 * error:+.2g} % at {step.frequency_hz:g} Hz {step.direction}"
     reason = f"level within {100 * tolerance:g} % at every step, worst {place}"
     if outside:
         reason = f"level off by more than {100 * tolerance:g} % at {outside} of {len(known)} steps"
         reason += f", worst {place}"
-    return _state("missed" if outside else "reached", reason, outside, error)
+    return ExcitationVerdict(
+        verdict="missed" if outside else "reached",
+        reason=reason,
+        outside=outside,
+        worst_error=error,
+    )
 
 
-def list_level_errors(steps: Iterable[Json]) -> list[tuple[float, Json]]:
+def list_level_errors(steps: Iterable[StepEntry]) -> list[tuple[float, StepEntry]]:
     """Return the relative error of the level with each step of a summary where it is known."""
     errors = [
-        (step["table_acc_fundamental_m_s2"] / step["demanded_m_s2"] - 1.0, step)
+        (step.table_acc_fundamental_m_s2 / step.demanded_m_s2 - 1.0, step)
         for step in steps
-        if step.get("demanded_m_s2") and step.get("table_acc_fundamental_m_s2") is not None
+        if step.demanded_m_s2
     ]
     return [(error, step) for error, step in errors if math.isfinite(error)]
 
 
-def _judge_record(tracking: Mapping[str, Any], profile: Profile) -> Json:
+def _judge_record(tracking: TrackingResult, profile: Profile) -> ExcitationVerdict:
     """Return the verdict on a record from its tracking error."""
-    peak, error = tracking["pga_ratio_band"], tracking["acc_rms_error_band"]
-    if peak is None or error is None or not math.isfinite(peak + error):
-        return _state("not judged", "samples of the acceleration of the table are missing")
+    peak, error = tracking.pga_ratio_band, tracking.acc_rms_error_band
+    if not math.isfinite(peak + error):
+        return _decline("samples of the acceleration of the table are missing")
     low, high = profile.tracking.required_lower, profile.tracking.required_upper
-    required = tracking["required_spectrum"]
+    required = tracking.required_spectrum
     faults = []
     if not low <= peak <= high:
         allowed = f"{100 * low:g} to {100 * high:g} %"
@@ -62,16 +66,21 @@ def _judge_record(tracking: Mapping[str, Any], profile: Profile) -> Json:
     if error > MAX_RECORD_ERROR:
         allowed = f"{100 * MAX_RECORD_ERROR:g} %"
         faults.append(f"acceleration {100 * error:.3g} % RMS off its target, allowed {allowed}")
-    if required is not None and required["outside"]:
-        faults.append(f"required spectrum missed at {required['outside']} ordinates")
+    if required is not None and required.outside:
+        faults.append(f"required spectrum missed at {required.outside} ordinates")
     text = f"PGA {100 * peak:.0f} % of the target, acceleration {100 * error:.2g} % RMS off it"
-    return _state("missed" if faults else "reached", ", ".join(faults) or text, len(faults), error)
+    return ExcitationVerdict(
+        verdict="missed" if faults else "reached",
+        reason=", ".join(faults) or text,
+        outside=len(faults),
+        worst_error=error,
+    )
 
 
-def _state(verdict: str, reason: str, outside: int = 0, error: float | None = None) -> Json:
-    return {"verdict": verdict, "reason": reason, "outside": outside, "worst_error": error}
+def _decline(reason: str) -> ExcitationVerdict:
+    return ExcitationVerdict(verdict="not judged", reason=reason, outside=0, worst_error=None)
 
 
-def format_excitation_verdict(verdict: Mapping[str, Any]) -> str:
+def format_excitation_verdict(verdict: ExcitationVerdict) -> str:
     """Return the line of a verdict for the console."""
-    return f"excitation {verdict['verdict']}: {verdict['reason']}"
+    return f"excitation {verdict.verdict}: {verdict.reason}"

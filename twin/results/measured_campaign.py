@@ -29,7 +29,7 @@ class MeasuredCampaign:
     def scale(self) -> tuple[float, float] | None:
         """Normalization (u* in m, a* in m/s2) of the measured points."""
         for run in (run for runs in self.runs.values() for run in runs):
-            return run.summary["u_star_m"], run.summary["a_star_m_s2"]
+            return run.summary.stars
         return None
 
     def extract_motion(
@@ -41,14 +41,11 @@ class MeasuredCampaign:
         """
         for run in self.runs.get(name, ()):
             for step in run.steps:
-                if (
-                    step["direction"] != direction
-                    or abs(step["frequency_hz"] - frequency_hz) > 1e-9
-                ):
+                if step.direction != direction or abs(step.frequency_hz - frequency_hz) > 1e-9:
                     continue
-                motion = report_data.extract_step_motion(run, "meas", step["index"])
+                motion = report_data.extract_step_motion(run, "meas", step.index)
                 if motion is not None and np.isfinite(motion.u).any():
-                    delay_s = _upcrossing_s(run, step["index"], frequency_hz, cycles)
+                    delay_s = _upcrossing_s(run, step.index, frequency_hz, cycles)
                     motion = motion.select_last(cycles)
                     return replace(motion, time=motion.time - delay_s)
         return None

@@ -15,56 +15,57 @@ from table_io.config.excitation.orbit_plan import OrbitPlan
 from table_io.errors import InputError
 from table_io.records import OrbitPoint
 from twin.recording.reader import Recording
+from twin.results.contracts import MeasuredFold, OrbitResult, PlannedOrbitEntry
 
 FOLD_ORBITS = 2  # on either side of a fold, to which a parabola is fitted
 MAX_FOLD_DISTANCE = 0.025  # of the frequency of a fold to theirs: a parabola holds close to it only
 
 
-def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[dict[str, Any]]:
-    """Return the entries of the measured orbits in the summary, in order of measurement."""
+def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[OrbitResult]:
+    """Return the measured orbits next to those of the plan, in order of measurement."""
     return [_summarise_orbit(orbit, plan) for orbit in recording.records(OrbitPoint)]
 
 
-def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> dict[str, Any]:
+def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> OrbitResult:
     feedback = math.hypot(*orbit.feedback_m)
     planned = plan.points[orbit.step]
-    return {
-        "index": orbit.step,
-        "frequency_hz": orbit.frequency_hz,
-        "acceleration_m_s2": orbit.acceleration_m_s2,
-        "amplitude_m": orbit.amplitude_m,
-        "fundamental_m": math.hypot(*orbit.u_m[2:4]),
-        "phase_deg": 90.0 + math.degrees(math.atan2(orbit.u_m[3], orbit.u_m[2])),
-        "feedback_m": feedback,
-        "feedback_share": feedback / orbit.command_m,
-        "feedback_harmonics_m": list(orbit.feedback_m),
-        "noise_m": orbit.noise_m,
-        "periods": orbit.periods,
-        "updates": orbit.updates,
-        "accepted": orbit.accepted,
-        "reason": orbit.reason,
-        "stable": orbit.stable,
-        "multiplier": orbit.multiplier,
-        "multiplier_sd": orbit.multiplier_sd,
-        "planned": {
-            "frequency_hz": planned.frequency_hz,
-            "amplitude_m": planned.amplitude_m,
-            "multiplier": planned.multiplier_size,
-        },
-    }
+    return OrbitResult(
+        index=orbit.step,
+        frequency_hz=orbit.frequency_hz,
+        acceleration_m_s2=orbit.acceleration_m_s2,
+        amplitude_m=orbit.amplitude_m,
+        fundamental_m=math.hypot(*orbit.u_m[2:4]),
+        phase_deg=90.0 + math.degrees(math.atan2(orbit.u_m[3], orbit.u_m[2])),
+        feedback_m=feedback,
+        feedback_share=feedback / orbit.command_m,
+        feedback_harmonics_m=list(orbit.feedback_m),
+        noise_m=orbit.noise_m,
+        periods=orbit.periods,
+        updates=orbit.updates,
+        accepted=orbit.accepted,
+        reason=orbit.reason,
+        stable=orbit.stable,
+        multiplier=orbit.multiplier,
+        multiplier_sd=orbit.multiplier_sd,
+        planned=PlannedOrbitEntry(
+            frequency_hz=planned.frequency_hz,
+            amplitude_m=planned.amplitude_m,
+            multiplier=planned.multiplier_size,
+        ),
+    )
 
 
-def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return the folds between measured orbits, entries of `summarise_orbits` of one branch.
+def find_measured_folds(orbits: Sequence[OrbitResult]) -> list[MeasuredFold]:
+    """Return the folds between measured orbits of one branch.
 
     Where the plan turns from stable to unstable, a parabola of the frequency over the amplitude
     of u is fitted to the accepted orbits, up to FOLD_ORBITS on either side. None is stated without
     an orbit on either side, or where the parabola turns outside of its orbits or far from them.
     """
-    accepted = [orbit for orbit in orbits if orbit["accepted"]]
-    amplitudes = np.array([orbit["amplitude_m"] for orbit in accepted])
-    frequencies = np.array([orbit["frequency_hz"] for orbit in accepted])
-    is_stable = np.array([orbit["stable"] for orbit in accepted], dtype=bool)
+    accepted = [orbit for orbit in orbits if orbit.accepted]
+    amplitudes = np.array([orbit.amplitude_m for orbit in accepted])
+    frequencies = np.array([orbit.frequency_hz for orbit in accepted])
+    is_stable = np.array([orbit.stable for orbit in accepted], dtype=bool)
     folds = []
     for last in np.flatnonzero(is_stable[1:] != is_stable[:-1]).tolist():
         near = slice(max(last + 1 - FOLD_ORBITS, 0), last + 1 + FOLD_ORBITS)
@@ -81,12 +82,12 @@ def find_measured_folds(orbits: Sequence[dict[str, Any]]) -> list[dict[str, Any]
         if not (x.min() < turn < x.max() and is_near):
             continue
         folds.append(
-            {
-                "kind": "lower" if parabola.deriv(2)(turn) > 0 else "upper",
-                "frequency_hz": fold_hz,
-                "amplitude_m": turn * float(amplitudes[last]),
-                "orbits": int(x.size),
-            }
+            MeasuredFold(
+                kind="lower" if parabola.deriv(2)(turn) > 0 else "upper",
+                frequency_hz=fold_hz,
+                amplitude_m=turn * float(amplitudes[last]),
+                orbits=int(x.size),
+            )
         )
     return folds
 

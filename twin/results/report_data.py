@@ -7,7 +7,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,9 +19,10 @@ from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.model import Model
 from twin.recording.reader import Recording
+from twin.results.contracts import OrbitResult, RunSummary, StepEntry, WindowResult
 from twin.results.players import SystemMotion
 from twin.results.rerun import restore_predictions
-from twin.results.summary import Json, parse_toml_tables, prc_points
+from twin.results.summary import parse_toml_tables, prc_points
 
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 Envelope = tuple[Float1D, Float1D, Float1D]
@@ -42,14 +42,14 @@ class ReportData:
     """Recording and summary of a run, with the blocks and the specimen that every figure needs."""
 
     recording: Recording
-    summary: Json
+    summary: RunSummary
     streams: dict[str, tuple[Block, ...]]
     specimen: Specimen | None
     contact_n: float
 
     @property
-    def steps(self) -> list[dict[str, Any]]:
-        return self.summary["steps"] or []
+    def steps(self) -> Sequence[StepEntry]:
+        return self.summary.steps
 
     @cached_property
     def points(self) -> list[PrcPoint]:
@@ -58,19 +58,19 @@ class ReportData:
     @property
     def source(self) -> str:
         """Source of the results: "measured", or "twin" if nothing was measured."""
-        results = [*self.steps, *self.windows]
-        is_measured = self.orbits or any(result.get("measured") for result in results)
+        results: list[StepEntry | WindowResult] = [*self.steps, *self.windows]
+        is_measured = self.orbits or any(result.measured for result in results)
         return "measured" if is_measured else "twin"
 
     @property
-    def orbits(self) -> list[dict[str, Any]]:
+    def orbits(self) -> list[OrbitResult]:
         """Measured periodic orbits of a continuation; none in other tests."""
-        return self.summary.get("orbits") or []
+        return self.summary.orbits or []
 
     @property
-    def windows(self) -> list[dict[str, Any]]:
+    def windows(self) -> list[WindowResult]:
         """Windows of a displacement history; none in a stepped sine."""
-        return self.summary.get("windows") or []
+        return self.summary.windows or []
 
     @property
     def gaps_m(self) -> tuple[float, float] | None:
@@ -97,7 +97,7 @@ class StepMotion(SystemMotion):
         return StepMotion(**{**arrays, "time": arrays["time"] - arrays["time"][0]})
 
 
-def build_report_data(recording: Recording, summary: Json) -> ReportData:
+def build_report_data(recording: Recording, summary: RunSummary) -> ReportData:
     """Build the report data of a run; an imported run without a profile has no specimen."""
     profile = parse_toml_tables(recording.start.profile_toml)
     try:
@@ -110,12 +110,11 @@ def build_report_data(recording: Recording, summary: Json) -> ReportData:
     return ReportData(recording, summary, streams, specimen, contact_n)
 
 
-def step_quantity(step: dict[str, Any], source: str, name: str) -> float:
+def step_quantity(step: StepEntry | PrcPoint, source: str, name: str) -> float:
     """Return a quantity of a step, averaged if given per cycle; NaN if absent."""
-    value = (step.get(source) or {}).get(name)
-    if isinstance(value, list):
-        return float(np.mean(value)) if value else math.nan
-    return math.nan if value is None else float(value)
+    response = getattr(step, source)
+    value = math.nan if response is None else getattr(response, name)
+    return float(np.mean(value)) if np.size(value) else math.nan
 
 
 def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: str) -> Curve:
@@ -131,7 +130,7 @@ def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: s
         sweep = next((known for known in sweeps if point.frequency_hz not in known), None)
         if sweep is None:
             sweeps.append(sweep := {})
-        sweep[point.frequency_hz] = _mean_quantity(point, source, name)
+        sweep[point.frequency_hz] = step_quantity(point, source, name)
     rows: list[tuple[float, float]] = []
     for sweep in sweeps:
         rows += [(math.nan, math.nan)] if rows else []
@@ -140,19 +139,13 @@ def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: s
     return table[:, 0], table[:, 1]
 
 
-def _mean_quantity(point: PrcPoint, source: str, name: str) -> float:
-    values = getattr(point, source)
-    value = np.nan if values is None else getattr(values, name)
-    return float(np.mean(value)) if np.size(value) else np.nan
-
-
 def compute_prestress(run: ReportData) -> dict[str, float]:
     """Return eta_r, eta_l, r_r, r_l of precompressed bumpers at rest by name, if known.
 
     A negative gap compresses a bumper by p_j = -gap_j: eta_j = p_j / u*, r_j = K_j p_j / (M g);
     its curve starts there (Stefani, De Angelis, Andreaus, Fig. 5).
     """
-    values, u_star = _read_model_values(run), run.summary.get("u_star_m") or math.nan
+    values, u_star = _read_model_values(run), run.summary.u_star_m or math.nan
     weight = values.get("mass", math.nan) * GRAVITY_M_S2
     ratios = {}
     for side, gap in zip("rl", run.gaps_m or (math.nan, math.nan), strict=True):
@@ -191,14 +184,14 @@ def select_frequencies(run: ReportData) -> dict[float, str]:
     The middles of the two widest hysteresis intervals, the peak of eta_d, and the step with most
     impacts per cycle; from the twin if nothing was measured.
     """
-    grid = sorted({step["frequency_hz"] for step in run.steps})
+    grid = sorted({step.frequency_hz for step in run.steps})
     reasons: dict[float, list[str]] = {}
-    intervals = run.summary.get("hysteresis") or []
-    widest = sorted(intervals, key=lambda interval: interval["from_hz"] - interval["to_hz"])
+    intervals = run.summary.hysteresis
+    widest = sorted(intervals, key=lambda interval: interval.from_hz - interval.to_hz)
     for interval in widest[:MAX_INTERVALS] if grid else ():
-        middle = (interval["from_hz"] + interval["to_hz"]) / 2
+        middle = (interval.from_hz + interval.to_hz) / 2
         nearest_hz = min(grid, key=lambda hz: abs(hz - middle))
-        reasons.setdefault(nearest_hz, []).append(f"inside the {interval['kind']} hysteresis")
+        reasons.setdefault(nearest_hz, []).append(f"inside the {interval.kind} hysteresis")
     for names, reason in (
         (("eta_d",), "largest excursion"),
         (IMPACT_KEYS, "most impacts per cycle"),
@@ -207,7 +200,7 @@ def select_frequencies(run: ReportData) -> dict[float, str]:
             sum(step_quantity(step, run.source, name) for name in names) for step in run.steps
         ]
         if np.nanmax([0.0, *values]) > 0:
-            peak_hz = run.steps[int(np.nanargmax(values))]["frequency_hz"]
+            peak_hz = run.steps[int(np.nanargmax(values))].frequency_hz
             reasons.setdefault(peak_hz, []).append(reason)
     return {hz: ", ".join(reasons[hz]) for hz in sorted(reasons)}
 
@@ -265,15 +258,15 @@ def pair_motions(
     run: ReportData, hz: float
 ) -> list[tuple[str, StepMotion | None, StepMotion | None]]:
     """Return (direction, measured, twin) at a frequency for each direction that has cycles."""
-    pairs = []
+    pairs: list[tuple[str, StepMotion | None, StepMotion | None]] = []
     for step in run.steps:
-        if step["frequency_hz"] == hz:
+        if step.frequency_hz == hz:
             motions = (
-                extract_step_motion(run, "meas", step["index"]),
-                extract_step_motion(run, "pred", step["index"]),
+                extract_step_motion(run, "meas", step.index),
+                extract_step_motion(run, "pred", step.index),
             )
             if any(motion is not None and np.isfinite(motion.u).any() for motion in motions):
-                pairs.append((step["direction"], *motions))
+                pairs.append((step.direction, *motions))
     return pairs
 
 
@@ -293,7 +286,7 @@ def compute_envelopes(run: ReportData) -> tuple[tuple[Block, ...], dict[str, lis
             (get_channel(block, "rel_disp_m") if prefix else relative_displacement(block)) * 1e3
         ),
     }
-    low_hz = min((step["frequency_hz"] for step in run.steps), default=1.0)
+    low_hz = min((step.frequency_hz for step in run.steps), default=1.0)
     envelopes = {
         label: [_compute_envelope(block, get_values, low_hz) for block in blocks]
         for label, get_values in rows.items()

@@ -1,8 +1,7 @@
 """Motion of the table against its target: tracking error of a run, and its required spectrum."""
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,6 +10,7 @@ from table_io.config.excitation import History, history_acceleration
 from table_io.config.profile import Profile
 from table_io.config.tracking import RequiredSpectrum, TrackingConfig
 from twin.recording.reader import Recording
+from twin.results.contracts import RequiredSpectrumResult, TrackingResult
 from twin.results.spectra import (
     USUAL_PER_OCTAVE,
     compute_response_spectrum,
@@ -18,8 +18,6 @@ from twin.results.spectra import (
 )
 from twin.results.tracking import MAX_BAND_RATIO, MAX_LAG_S, judge_tracking
 from twin.results.windows import find_windows, join_channel
-
-Json = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,8 +102,8 @@ def _extract_channel(blocks: tuple[Block, ...], name: str, first: int, end: int)
     return values
 
 
-def summarise_tracking(recording: Recording, profile: Profile) -> Json | None:
-    """Return the entry `tracking` of a summary, see `TrackingResult`; None without a target."""
+def summarise_tracking(recording: Recording, profile: Profile) -> TrackingResult | None:
+    """Return the error of the table against its target; None without a target."""
     motion = find_table_motion(recording, profile)
     if motion is None:
         return None
@@ -123,16 +121,13 @@ def summarise_tracking(recording: Recording, profile: Profile) -> Json | None:
         target_disp=motion.target_disp_m if has_displacement else None,
         achieved_disp=motion.achieved_disp_m,
     )
-    entry = asdict(error) | {
-        "band_hz": list(error.band_hz),
-        "from_s": motion.start / motion.rate_hz,
-        "to_s": motion.end / motion.rate_hz,
-    }
     required = config.spectrum
-    entry["required_spectrum"] = (
-        None if required is None else _check_required(motion, required, config)
+    return TrackingResult(
+        **dict(error),
+        from_s=motion.start / motion.rate_hz,
+        to_s=motion.end / motion.rate_hz,
+        required_spectrum=None if required is None else _check_required(motion, required, config),
     )
-    return entry
 
 
 def list_required_frequencies(required: RequiredSpectrum, rate_hz: float) -> Float1D:
@@ -146,22 +141,22 @@ def list_required_frequencies(required: RequiredSpectrum, rate_hz: float) -> Flo
 
 def _check_required(
     motion: TableMotion, required: RequiredSpectrum, config: TrackingConfig
-) -> Json:
+) -> RequiredSpectrumResult:
     """Return the check of the spectrum of the table against the required one."""
     hz = list_required_frequencies(required, motion.rate_hz)
-    entry: Json = {
-        "lower": config.required_lower,
-        "upper": config.required_upper,
-        "count": hz.size,
-        "outside": None,
-        "lowest_ratio": None,
-        "lowest_hz": None,
-        "highest_ratio": None,
-        "highest_hz": None,
-        "passed": False,
-    }
+    result = RequiredSpectrumResult(
+        lower=config.required_lower,
+        upper=config.required_upper,
+        count=hz.size,
+        outside=None,
+        lowest_ratio=None,
+        lowest_hz=None,
+        highest_ratio=None,
+        highest_hz=None,
+        passed=False,
+    )
     if not hz.size or not np.isfinite(motion.achieved_acc_m_s2).all():
-        return entry
+        return result
     spectrum = compute_response_spectrum(
         motion.achieved_acc_m_s2, motion.rate_hz, hz, config.damping
     )
@@ -170,46 +165,44 @@ def _check_required(
         np.count_nonzero((ratios < config.required_lower) | (ratios > config.required_upper))
     )
     lowest, highest = int(np.argmin(ratios)), int(np.argmax(ratios))
-    return entry | {
-        "outside": outside,
-        "lowest_ratio": float(ratios[lowest]),
-        "lowest_hz": float(hz[lowest]),
-        "highest_ratio": float(ratios[highest]),
-        "highest_hz": float(hz[highest]),
-        "passed": outside == 0,
-    }
+    result.outside = outside
+    result.lowest_ratio = float(ratios[lowest])
+    result.lowest_hz = float(hz[lowest])
+    result.highest_ratio = float(ratios[highest])
+    result.highest_hz = float(hz[highest])
+    result.passed = outside == 0
+    return result
 
 
-def format_tracking(tracking: Json) -> str:
+def format_tracking(tracking: TrackingResult) -> str:
     """Format the tracking error of a summary in one sentence: RMS, PGA, SA, lag, RRS."""
-    low_hz, high_hz = tracking["band_hz"]
+    low_hz, high_hz = tracking.band_hz
     band = f"{low_hz:.2g} to {high_hz:.2g} Hz"
     parts = [
-        f"table acceleration {_format_percent(tracking['acc_rms_error_band'])} RMS off its target "
-        f"in {band} ({_format_percent(tracking['acc_rms_error_full'])} in full)",
-        f"PGA {_format_percent(tracking['pga_ratio_band'])} of it "
-        f"({_format_percent(tracking['pga_ratio_full'])})",
+        f"table acceleration {_format_percent(tracking.acc_rms_error_band)} RMS off its target "
+        f"in {band} ({_format_percent(tracking.acc_rms_error_full)} in full)",
+        f"PGA {_format_percent(tracking.pga_ratio_band)} of it "
+        f"({_format_percent(tracking.pga_ratio_full)})",
     ]
-    if tracking["sa_count"]:
-        inside = round(tracking["sa_share"] * tracking["sa_count"])
-        parts.append(f"{inside} of {tracking['sa_count']} SA within 10 %")
-    parts.append(f"lag {1e3 * tracking['lag_s']:.3g} ms")
-    if tracking["lost_samples"]:
-        parts.append(f"{tracking['lost_samples']} samples lost")
-    required = tracking["required_spectrum"]
-    if required is not None:
-        parts.append(format_required(required))
+    if tracking.sa_count:
+        inside = round(tracking.sa_share * tracking.sa_count)
+        parts.append(f"{inside} of {tracking.sa_count} SA within 10 %")
+    parts.append(f"lag {1e3 * tracking.lag_s:.3g} ms")
+    if tracking.lost_samples:
+        parts.append(f"{tracking.lost_samples} samples lost")
+    if tracking.required_spectrum is not None:
+        parts.append(format_required(tracking.required_spectrum))
     return ", ".join(parts)
 
 
-def format_required(required: Json) -> str:
+def format_required(required: RequiredSpectrumResult) -> str:
     """Format the check of a required spectrum."""
-    if required["outside"] is None:
+    if required.outside is None:
         return "required spectrum not checked"
-    if required["passed"]:
+    if required.passed:
         return "required spectrum met"
-    return f"required spectrum missed at {required['outside']} of {required['count']} ordinates"
+    return f"required spectrum missed at {required.outside} of {required.count} ordinates"
 
 
-def _format_percent(ratio: float | None) -> str:
-    return f"{100 * ratio:.3g} %" if ratio is not None and math.isfinite(ratio) else "–"
+def _format_percent(ratio: float) -> str:
+    return f"{100 * ratio:.3g} %" if math.isfinite(ratio) else "–"

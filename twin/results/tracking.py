@@ -11,13 +11,13 @@ the noise of the sensor and the ringing of the table.
 """
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D
 from table_io.config.excitation import find_energy_band
+from twin.results.contracts import TrackingError
 from twin.results.spectra import (
     DEFAULT_DAMPING,
     FINE_PER_OCTAVE,
@@ -35,37 +35,6 @@ MAX_LAG_S = 0.5  # that is looked for, on either side
 LAG_ITERATIONS, MASK_ITERATIONS = 20, 10
 Bool1D = npt.NDArray[np.bool_]
 Complex1D = npt.NDArray[np.complex128]
-
-
-@dataclass(frozen=True, slots=True)
-class TrackingError:
-    """Achieved motion against target; ratios of 1, a perfect table has errors 0 and ratios 1.
-
-    NaN where a number cannot be had: without a displacement, and of all that needs every sample
-    (the band, spectra, energy) where `lost_samples` are missing in the acceleration, as those are
-    left out, not replaced. `lag_s` is positive if the table is late. `sa_share` is the share of the
-    `sa_count` ordinates of the 1/6-octave spectrum of the absolute acceleration in the band within
-    10 % of the target; `sa_worst_ratio` is the one farthest from it, achieved over target.
-    `sa_fine_share` is the share of the 1/72-octave spectrum, which shows narrow faults.
-    """
-
-    band_hz: tuple[float, float]
-    damping: float
-    lag_s: float
-    acc_rms_error_band: float
-    acc_rms_error_full: float
-    pga_ratio_band: float
-    pga_ratio_full: float
-    sa_share: float
-    sa_count: int
-    sa_worst_ratio: float
-    sa_worst_hz: float
-    sa_fine_share: float
-    arias_ratio: float
-    cav_ratio: float
-    disp_rms_error_band: float
-    disp_rms_error_full: float
-    lost_samples: int
 
 
 def judge_tracking(
@@ -127,11 +96,24 @@ def judge_tracking(
             delay_record(target_disp, lag_s, rate_hz), achieved_disp, rate_hz, band
         )
     return TrackingError(
-        (float(low_hz), float(high_hz)), damping, lag_s, rms_band, rms_full, pga_band,
-        _divide(_find_peak(achieved_acc[known]), _find_peak(target[known])),
-        sa_share, sa_count, worst_ratio, worst_hz, fine_share, arias, cav, disp_band, disp_full,
-        int(np.count_nonzero(~known)),
-    )  # fmt: skip
+        band_hz=(float(low_hz), float(high_hz)),
+        damping=damping,
+        lag_s=lag_s,
+        acc_rms_error_band=rms_band,
+        acc_rms_error_full=rms_full,
+        pga_ratio_band=pga_band,
+        pga_ratio_full=_divide(_find_peak(achieved_acc[known]), _find_peak(target[known])),
+        sa_share=sa_share,
+        sa_count=sa_count,
+        sa_worst_ratio=worst_ratio,
+        sa_worst_hz=worst_hz,
+        sa_fine_share=fine_share,
+        arias_ratio=arias,
+        cav_ratio=cav,
+        disp_rms_error_band=disp_band,
+        disp_rms_error_full=disp_full,
+        lost_samples=int(np.count_nonzero(~known)),
+    )
 
 
 def find_band(target_acc: Float1D, rate_hz: float) -> tuple[float, float]:

@@ -28,7 +28,7 @@ import math
 import shlex
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -47,9 +47,22 @@ from twin.compare.monitoring.cycle import ChannelNoise
 from twin.compare.monitoring.jumps import JUMP_TOLERANCE, measure_separation
 from twin.model.parameters import Parameters
 from twin.recording.reader import Recording
+from twin.results.contracts import (
+    NOTHING_MEASURED,
+    ChannelError,
+    HysteresisInterval,
+    Jump,
+    Phase,
+    RunSummary,
+    StepBranch,
+    StepEntry,
+    StepMisfit,
+    TwinVerdict,
+    WorstBranch,
+    WorstMisfit,
+)
 from twin.results.quantities import format_quantity
 
-Json = dict[str, Any]
 CHANNEL_SYMBOLS = {"rel_disp_m": ("u", "m"), "mass_acc_m_s2": ("a", "m/s2")}
 JUDGED_CHANNELS = tuple(CHANNEL_SYMBOLS)
 UNKNOWN = (0.0, 0.0, math.nan)  # shares in contact, travel
@@ -57,14 +70,14 @@ MOTION_SENSORS = (
     "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
 )  # fmt: skip
 CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
-PHASES = ("flight", "contact_right", "contact_left")
+Verdict = Literal["agrees", "departs", "not judged"]
+PHASES: tuple[Phase, ...] = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 # Range of eta_d over the cycles, relative to its mean, up to which a motion counts as periodic and
 # has a phase.
 MAX_PERIODIC_SPREAD = 0.05
 MAX_FREE_ERROR = 1.0  # of a periodic motion, over the motion itself: a phase of 60 degrees
 MAX_UNREMARKABLE_MISFIT = 3.0  # times the noise: beyond it, parameters or effects can be found
-NOTHING_MEASURED = "nothing was measured that the twin predicts"
 HISTORY_TOLERANCE_TEXT = f"{100 * AMPLITUDE_TOLERANCE:g} % of the rms, beyond the noise"
 TOLERANCE_TEXT = (
     f"{NOISE_FACTOR:g} x noise at rest + {100 * AMPLITUDE_TOLERANCE:g} % of the amplitude"
@@ -78,7 +91,7 @@ def summarise_agreement(
     profile: Profile,
     noise_rms: Mapping[str, float],
     clipped: Container[int],
-) -> dict[int, Json]:
+) -> dict[int, dict[str, StepMisfit]]:
     """Return by step and channel the error of the restarted twin, its band and its phase.
 
     The cycle is that with the median of error over band; rms in SI, `misfit` in multiples of the
@@ -179,8 +192,8 @@ def _median_half_range(ranges: Mapping[int, tuple[float, float]]) -> float:
 
 def _summarise_step(
     records: Sequence[Agreement], allowance: Mapping[str, float], noise_rms: Mapping[str, float]
-) -> Json:
-    entry: Json = {}
+) -> dict[str, StepMisfit]:
+    misfits = {}
     for column, name in enumerate(records[0].channels):
         known = [
             record
@@ -192,21 +205,20 @@ def _summarise_step(
         known.sort(key=lambda record: record.error[column] / record.band[column])
         median = known[len(known) // 2]
         phase_errors = [errors[column] for errors in (median.flight, median.right, median.left)]
+        is_phase_known = np.isfinite(phase_errors).any()
         noise = noise_rms.get(name, math.nan)
-        entry[name] = {
-            "error": median.error[column],
-            "band": median.band[column] + allowance[name],
-            "misfit": median.error[column] / noise if noise > 0 else None,
-            "phase": PHASES[int(np.nanargmax(phase_errors))]
-            if np.isfinite(phase_errors).any()
-            else "",
-        }
-    return entry
+        misfits[name] = StepMisfit(
+            error=median.error[column],
+            band=median.band[column] + allowance[name],
+            misfit=median.error[column] / noise if noise > 0 else None,
+            phase=PHASES[int(np.nanargmax(phase_errors))] if is_phase_known else "",
+        )
+    return misfits
 
 
 def compare_branches(
     point: PrcPoint, free_error: float, noise: ChannelNoise, u_star_m: float | None
-) -> Json | None:
+) -> StepBranch | None:
     """Return whether the free twin is on the branch of the specimen at a step; None if unknown.
 
     `free_error` is its rms error of u over the rms of u, in the measured cycles; `share` is the
@@ -220,11 +232,7 @@ def compare_branches(
         return None
     is_periodic = max(measured.spread, twin.spread) <= MAX_PERIODIC_SPREAD
     is_opposed = is_periodic and free_error > MAX_FREE_ERROR
-    return {
-        "is_same": share <= 1 and not is_opposed,
-        "share": share,
-        "free_error": free_error if math.isfinite(free_error) else None,
-    }
+    return StepBranch(is_same=share <= 1 and not is_opposed, share=share, free_error=free_error)
 
 
 def sum_free_errors(
@@ -255,261 +263,250 @@ def sum_free_errors(
     return ratios
 
 
-def judge_twin(summary: Mapping[str, Any]) -> Json:
-    """Return the entry `twin_verdict` of a summary, from its other entries alone."""
+def judge_twin(summary: RunSummary) -> TwinVerdict:
+    """Return the verdict on the twin of a run, from its other results alone."""
     worst = _find_worst(summary)
-    outside = [
-        step for step in summary["steps"] if any(share > 1 for share in _band_shares(step).values())
-    ]
-    grid = sorted({step["frequency_hz"] for step in summary["steps"]})
-    measured, modelled = (
-        (summary.get(f"{prefix}jumps") or [], summary.get(f"{prefix}hysteresis") or [])
-        for prefix in ("", "twin_")
-    )
-    missing = _list_unmatched(modelled[0], *measured, grid)
-    unexpected = _list_unmatched(measured[0], *modelled, grid)
-    apart = [*_list_steps_apart(summary, measured[0], modelled[0])]
-    worst_branch = max(apart, key=_measure_departure, default=None)
-    warnings = summary.get("warnings") or []
+    outside = [step for step in summary.steps if any(share > 1 for share in _band_shares(step))]
+    grid = sorted({step.frequency_hz for step in summary.steps})
+    missing = _list_unmatched(summary.twin_jumps, summary.jumps, summary.hysteresis, grid)
+    unexpected = _list_unmatched(summary.jumps, summary.twin_jumps, summary.twin_hysteresis, grid)
+    apart = [*_list_steps_apart(summary)]
+    worst_branch = max(apart, key=lambda place: place.departure, default=None)
     departures = [
         warning
-        for warning in warnings
-        if warning["kind"] == DEPARTURE_KIND and not warning.get("is_clipped")
+        for warning in summary.warnings
+        if warning.kind == DEPARTURE_KIND and not warning.is_clipped
     ]
     judged = _count_judged(summary)
     reasons = []
     if outside:
         reasons.append(f"{len(outside)} of {judged} steps outside the tolerance")
-    elif worst and worst["share"] > 1:
+    elif worst and worst.share > 1:
         reasons.append("the history is outside the tolerance")
     if worst_branch:
         count = f"{len(apart)} step{'s' if len(apart) > 1 else ''}"
         reasons.append(f"another response at {count}: {describe_branch(worst_branch)}")
     reasons += [
-        f"{len(items)} {noun}{'s' if len(items) > 1 else ''}"
-        for items, noun in (
-            (missing, "missing jump"),
-            (unexpected, "unexpected jump"),
-            (departures, "warning"),
+        f"{count} {noun}{'s' if count > 1 else ''}"
+        for count, noun in (
+            (len(missing), "missing jump"),
+            (len(unexpected), "unexpected jump"),
+            (len(departures), "warning"),
         )
-        if items
+        if count
     ]
-    planned, clipped = _count_planned(summary), summary.get("clipped_steps") or ()
+    planned = _count_planned(summary)
     misfits = _list_misfits(summary)
     misfit = float(np.median(misfits)) if misfits else None
-    if (summary.get("run") or {}).get("source") == "model" or (worst is None and not apart):
-        verdict, reasons = "not judged", [_explain_no_tolerance(summary)]
-    elif not planned and summary.get("clipped_channels"):
-        channels = ", ".join(summary["clipped_channels"])
-        verdict, reasons = "not judged", [f"off the range of their sensor: {channels}"]
+    verdict: Verdict = "not judged"
+    if summary.run.source == "model" or (worst is None and not apart):
+        reasons = [_explain_no_tolerance(summary)]
+    elif not planned and summary.clipped_channels:
+        reasons = [f"off the range of their sensor: {', '.join(summary.clipped_channels)}"]
     elif reasons:
         verdict = "departs"
     else:
         verdict, reasons = _judge_agreement(summary, judged, misfit)
     if worst and judged < planned:
         reasons.append(f"{judged} of {planned} steps judged")
-    if worst and clipped:
-        reasons.append(f"{len(clipped)} steps with a sensor off its range")
-    return {
-        "verdict": verdict,
-        "reason": ", ".join(reasons),
-        "tolerance": TOLERANCE_TEXT if planned else HISTORY_TOLERANCE_TEXT,
-        "worst": worst,
-        "worst_branch": worst_branch,
-        "steps_outside": len(outside),
-        "steps_apart": len(apart),
-        "steps_judged": judged,
-        "misfit": misfit,
-        "misfit_worst": max(misfits, default=None),
-        "missing_jumps": missing,
-        "unexpected_jumps": unexpected,
-        "warnings": len(warnings),
-        "next_command": _suggest_command(summary, verdict, misfit),
-    }
+    if worst and summary.clipped_steps:
+        reasons.append(f"{len(summary.clipped_steps)} steps with a sensor off its range")
+    return TwinVerdict(
+        verdict=verdict,
+        reason=", ".join(reasons),
+        tolerance=TOLERANCE_TEXT if planned else HISTORY_TOLERANCE_TEXT,
+        worst=worst,
+        worst_branch=worst_branch,
+        steps_outside=len(outside),
+        steps_apart=len(apart),
+        steps_judged=judged,
+        misfit=misfit,
+        misfit_worst=max(misfits, default=None),
+        missing_jumps=missing,
+        unexpected_jumps=unexpected,
+        warnings=len(summary.warnings),
+        next_command=_suggest_command(summary, verdict, misfit),
+    )
 
 
 def _judge_agreement(
-    summary: Mapping[str, Any], judged: int, misfit: float | None
-) -> tuple[str, list[str]]:
+    summary: RunSummary, judged: int, misfit: float | None
+) -> tuple[Verdict, list[str]]:
     """Return the verdict on a twin of which nothing departs, and its reasons."""
-    if 2 * judged < len(summary["steps"]):
+    if 2 * judged < len(summary.steps):
         return "not judged", ["too few steps can be judged"]
     reasons = ["within the tolerance"]
-    if summary["steps"] and summary["verdict"] == "complete":
+    if summary.steps and summary.verdict == "complete":
         reasons.append("on the same branch at every step, every jump in its place")
     if _is_remarkable(misfit):
         reasons.append(f"but u differs by {misfit:.2g} times the noise")
-    if (summary.get("excitation_verdict") or {}).get("verdict") == "missed":
+    if summary.excitation_verdict and summary.excitation_verdict.verdict == "missed":
         return "not judged", [*reasons, "but the table did not play this test"]
     return "agrees", reasons
 
 
-def _list_steps_apart(
-    summary: Mapping[str, Any], jumps: Sequence[Json], twin_jumps: Sequence[Json]
-) -> Iterator[Json]:
+def _list_steps_apart(summary: RunSummary) -> Iterator[WorstBranch]:
     """Yield the steps at which the free twin is on another branch than the specimen.
 
     But those between a jump and its counterpart, where one came a step of the grid later.
     """
-    clipped = summary.get("clipped_steps") or ()
-    for step in summary["steps"]:
-        branch = step.get("branch")
-        if branch is None or branch["is_same"] or step["index"] in clipped:
+    for step in summary.steps:
+        branch, measured, twin = step.branch, step.measured, step.twin
+        if branch is None or branch.is_same or step.index in summary.clipped_steps:
             continue
-        if not any(
-            _is_between(step, jump, other)
-            for jump in jumps
-            for other in twin_jumps
-            if _is_same_jump(jump, other)
+        if (
+            measured is None
+            or twin is None
+            or any(
+                _is_between(step, jump, other)
+                for jump in summary.jumps
+                for other in summary.twin_jumps
+                if _is_same_jump(jump, other)
+            )
         ):
-            measured, twin = (step[source]["eta_d"] for source in ("measured", "twin"))
-            yield {
-                "step": step["index"],
-                "direction": step["direction"],
-                "frequency_hz": step["frequency_hz"],
-                "measured": measured,
-                "twin": twin,
-                "free_error": branch["free_error"],
-            }
+            continue
+        yield WorstBranch(
+            step=step.index,
+            direction=step.direction,
+            frequency_hz=step.frequency_hz,
+            measured=measured.eta_d,
+            twin=twin.eta_d,
+            free_error=branch.free_error,
+        )
 
 
-def _is_between(step: Json, jump: Json, other: Json) -> bool:
+def _is_between(step: StepEntry, jump: Jump, other: Jump) -> bool:
     """Return whether a step lies after one of two jumps and before the other."""
-    first, last = sorted((jump["to_hz"], other["to_hz"]))
-    if step["direction"] != jump["direction"]:
+    first, last = sorted((jump.to_hz, other.to_hz))
+    if step.direction != jump.direction:
         return False
-    if step["direction"] == "forward":
-        return bool(first <= step["frequency_hz"] < last)
-    return bool(first < step["frequency_hz"] <= last)
+    if step.direction == "forward":
+        return first <= step.frequency_hz < last
+    return first < step.frequency_hz <= last
 
 
-def _measure_departure(entry: Json) -> float:
-    """Return how far two eta_d are apart, as a ratio of at least 1."""
-    low, high = sorted((entry["measured"], entry["twin"]))
-    return float(high / low) if low > 0 else math.inf
-
-
-def describe_branch(entry: Mapping[str, Any]) -> str:
+def describe_branch(place: WorstBranch) -> str:
     """Describe a step at which the twin responds in another way than the specimen."""
     kind = "opposite in phase"
-    if entry["measured"] != entry["twin"] and (entry["free_error"] or 0.0) <= MAX_FREE_ERROR:
+    if place.measured != place.twin and (place.free_error or 0.0) <= MAX_FREE_ERROR:
         kind = "another amplitude"
-    if _measure_departure(dict(entry)) >= MIN_JUMP_RATIO:
+    if place.departure >= MIN_JUMP_RATIO:
         kind = "another branch"
     return (
-        f"{entry['frequency_hz']:g} Hz {entry['direction']}, {kind}, eta_d {entry['measured']:.3f} "
-        f"measured, {entry['twin']:.3f} of the twin"
+        f"{place.frequency_hz:g} Hz {place.direction}, {kind}, eta_d {place.measured:.3f} "
+        f"measured, {place.twin:.3f} of the twin"
     )
 
 
-def _band_shares(step: Mapping[str, Any]) -> dict[str, float]:
+def _band_shares(step: StepEntry) -> list[float]:
     """Return error over band of the judged channels of a step."""
-    agreement = step.get("agreement") or {}
-    return {
-        name: agreement[name]["error"] / agreement[name]["band"]
-        for name in JUDGED_CHANNELS
-        if name in agreement
-    }
+    return [step.agreement[name].share for name in JUDGED_CHANNELS if name in step.agreement]
 
 
-def _count_judged(summary: Mapping[str, Any]) -> int:
-    return sum(bool(_band_shares(step)) for step in summary["steps"])
+def _count_judged(summary: RunSummary) -> int:
+    return sum(bool(_band_shares(step)) for step in summary.steps)
 
 
-def _count_planned(summary: Mapping[str, Any]) -> int:
+def _count_planned(summary: RunSummary) -> int:
     """Return the planned steps, without a plan the measured ones; 0 for a history."""
-    return max(summary.get("planned_steps") or 0, len(summary["steps"]))
+    return max(summary.planned_steps, len(summary.steps))
 
 
-def _explain_no_tolerance(summary: Mapping[str, Any]) -> str:
+def _explain_no_tolerance(summary: RunSummary) -> str:
     """Return the reason why nothing of a run can be judged."""
-    error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
-    is_compared = (summary.get("run") or {}).get("source") != "model" and error.get("nrmse")
+    error = _find_error(summary, JUDGED_CHANNELS[0])
+    is_compared = summary.run.source != "model" and error.nrmse
     if not is_compared or not _count_planned(summary):
         return NOTHING_MEASURED
-    if len(summary.get("clipped_steps") or ()) == len(summary["steps"]) > 0:
+    if len(summary.clipped_steps) == len(summary.steps) > 0:
         return "a sensor was off its range in every step"
-    if error.get("noise_floor"):
+    if error.noise_floor:
         return "no step has a whole cycle of twin and rig to compare"
     return "the noise of the sensors is unknown, so no step has a tolerance"
 
 
-def _find_worst(summary: Mapping[str, Any]) -> Json | None:
+def _find_error(summary: RunSummary, channel: str) -> ChannelError:
+    return summary.comparison.get(channel, ChannelError())
+
+
+def _find_worst(summary: RunSummary) -> WorstMisfit | None:
     """Return the step and channel, or of a history the channel, with the largest misfit."""
     places = [
-        (share, step, name)
-        for step in summary["steps"]
-        for name, share in _band_shares(step).items()
+        (step, name) for step in summary.steps for name in JUDGED_CHANNELS if name in step.agreement
     ]
     if places:
-        share, step, name = max(places, key=lambda place: place[0])
-        return {
-            "step": step["index"],
-            "direction": step["direction"],
-            "frequency_hz": step["frequency_hz"],
-            "channel": name,
-            "share": share,
-            **step["agreement"][name],
-        }
+        step, name = max(places, key=lambda place: place[0].agreement[place[1]].share)
+        misfit = step.agreement[name]
+        return WorstMisfit(
+            step=step.index,
+            direction=step.direction,
+            frequency_hz=step.frequency_hz,
+            channel=name,
+            share=misfit.share,
+            **dict(misfit),
+        )
     if _count_planned(summary):
         return None
-    errors = {name: (summary.get("comparison") or {}).get(name) or {} for name in JUDGED_CHANNELS}
+    errors = {name: _find_error(summary, name) for name in JUDGED_CHANNELS}
     shares = {
-        name: error["nrmse"] / math.hypot(error.get("noise_floor") or 0.0, AMPLITUDE_TOLERANCE)
+        name: error.nrmse / math.hypot(error.noise_floor or 0.0, AMPLITUDE_TOLERANCE)
         for name, error in errors.items()
-        if error.get("nrmse") is not None
+        if error.nrmse is not None
     }
     if not shares:
         return None
     name = max(shares, key=lambda channel: shares[channel])
-    floor = errors[name].get("noise_floor")
-    return {
-        "step": None, "direction": None, "frequency_hz": None, "channel": name,
-        "share": shares[name], "error": None, "band": None,
-        "misfit": errors[name]["nrmse"] / floor if floor else None, "phase": "",
-    }  # fmt: skip
+    return WorstMisfit(
+        step=None,
+        direction=None,
+        frequency_hz=None,
+        channel=name,
+        share=shares[name],
+        error=None,
+        band=None,
+        misfit=errors[name].noise_multiple,
+        phase="",
+    )
 
 
-def _list_misfits(summary: Mapping[str, Any]) -> list[float]:
+def _list_misfits(summary: RunSummary) -> list[float]:
     """Return the misfit of u in multiples of the noise at each step.
 
     Of a displacement history, one: NRMSE over noise floor.
     """
-    misfits = [
-        float(entry["misfit"])
-        for step in summary["steps"]
-        if (entry := (step.get("agreement") or {}).get(JUDGED_CHANNELS[0])) and entry["misfit"]
-    ]
+    entries = [step.agreement.get(JUDGED_CHANNELS[0]) for step in summary.steps]
+    misfits = [entry.misfit for entry in entries if entry is not None and entry.misfit]
     if misfits:
         return misfits
-    error = (summary.get("comparison") or {}).get(JUDGED_CHANNELS[0]) or {}
-    if error.get("nrmse") is None or not error.get("noise_floor"):
-        return []
-    return [float(error["nrmse"] / error["noise_floor"])]
+    multiple = _find_error(summary, JUDGED_CHANNELS[0]).noise_multiple
+    return [] if multiple is None else [multiple]
 
 
-def format_misfit(verdict: Mapping[str, Any]) -> str:
+def format_misfit(verdict: TwinVerdict | None) -> str:
     """Format the misfit of u in multiples of the noise: median and worst step; "" if unknown."""
-    median, worst = verdict.get("misfit"), verdict.get("misfit_worst")
-    if median is None:
+    if verdict is None or verdict.misfit is None:
         return ""
+    median, worst = verdict.misfit, verdict.misfit_worst
     text = f"{median:.2g} times the noise"
     return text if worst is None or worst == median else f"{text} (worst step {worst:.2g})"
 
 
 def _list_unmatched(
-    jumps: Sequence[Json], others: Sequence[Json], intervals: Sequence[Json], grid: Sequence[float]
-) -> list[Json]:
+    jumps: Sequence[Jump],
+    others: Sequence[Jump],
+    intervals: Sequence[HysteresisInterval],
+    grid: Sequence[float],
+) -> list[Jump]:
     """Return the jumps without a counterpart among those of the other source.
 
     A jump into the last step of the sweep is not judged if the other's hysteresis, `intervals`,
     reaches that end: the counterpart may lie beyond.
     """
 
-    def leaves_range(jump: Json) -> bool:
-        end = grid[-1] if jump["direction"] == "forward" else grid[0]
-        reached = any(end in (entry["from_hz"], entry["to_hz"]) for entry in intervals)
-        return bool(jump["to_hz"] == end and reached)
+    def leaves_range(jump: Jump) -> bool:
+        end = grid[-1] if jump.direction == "forward" else grid[0]
+        reached = any(end in (interval.from_hz, interval.to_hz) for interval in intervals)
+        return jump.to_hz == end and reached
 
     return [
         jump
@@ -518,64 +515,62 @@ def _list_unmatched(
     ]
 
 
-def _is_same_jump(jump: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+def _is_same_jump(jump: Jump, other: Jump) -> bool:
     """Return whether two jumps are one: within a step of the grid, and within 2 % of frequency."""
-    if (jump["direction"], jump["kind"]) != (other["direction"], other["kind"]):
+    if (jump.direction, jump.kind) != (other.direction, other.kind):
         return False
-    grid_step_hz = abs(jump["to_hz"] - jump["from_hz"])
-    tolerance_hz = min(grid_step_hz, JUMP_TOLERANCE * jump["to_hz"])
-    return abs(jump["to_hz"] - other["to_hz"]) <= tolerance_hz * (1 + 1e-9)
+    grid_step_hz = abs(jump.to_hz - jump.from_hz)
+    tolerance_hz = min(grid_step_hz, JUMP_TOLERANCE * jump.to_hz)
+    return abs(jump.to_hz - other.to_hz) <= tolerance_hz * (1 + 1e-9)
 
 
 def _is_remarkable(misfit: float | None) -> bool:
     return misfit is not None and misfit > MAX_UNREMARKABLE_MISFIT
 
 
-def _suggest_command(summary: Mapping[str, Any], verdict: str, misfit: float | None) -> str:
+def _suggest_command(summary: RunSummary, verdict: str, misfit: float | None) -> str:
     """Return the command to type next; DIR stands for the folder of the run."""
-    if summary["verdict"] != "complete":
+    if summary.verdict != "complete":
         return "shaketwin verify DIR"
-    if verdict == "departs" and any(
-        warning["kind"] == "instrument" for warning in summary.get("warnings") or ()
-    ):
+    if verdict == "departs" and any(warning.kind == "instrument" for warning in summary.warnings):
         return "shaketwin identify DIR"  # judges the instruments too
     if verdict == "departs" or (verdict == "agrees" and _is_remarkable(misfit)):
         return "shaketwin discover DIR"
     return "shaketwin view DIR"
 
 
-def format_twin_verdict(verdict: Mapping[str, Any], folder: Path) -> list[str]:
+def format_twin_verdict(verdict: TwinVerdict, folder: Path) -> list[str]:
     """Return the lines of a verdict for the console: verdict, worst place, jumps, next command."""
-    lines = [f"twin {verdict['verdict']}: {verdict['reason']}"]
+    lines = [f"twin {verdict.verdict}: {verdict.reason}"]
     if misfit := format_misfit(verdict):
         lines.append(f"misfit of u: {misfit}")
-    if worst := verdict["worst"]:
-        lines.append(f"worst: {describe_worst(worst)}; tolerance {verdict['tolerance']}")
-    for name in ("missing", "unexpected"):
-        lines += [f"{name}: {format_jump(jump)}" for jump in verdict[f"{name}_jumps"]]
+    if verdict.worst:
+        lines.append(f"worst: {describe_worst(verdict.worst)}; tolerance {verdict.tolerance}")
+    lines += [f"missing: {format_jump(jump)}" for jump in verdict.missing_jumps]
+    lines += [f"unexpected: {format_jump(jump)}" for jump in verdict.unexpected_jumps]
     return [*lines, f"next: {name_command(verdict, folder)}"]
 
 
-def name_command(verdict: Mapping[str, Any], folder: Path) -> str:
+def name_command(verdict: TwinVerdict, folder: Path) -> str:
     """Return the next command with the folder of the run in place of DIR."""
-    return str(verdict["next_command"]).replace("DIR", shlex.quote(str(folder)))
+    return verdict.next_command.replace("DIR", shlex.quote(str(folder)))
 
 
-def describe_worst(worst: Mapping[str, Any]) -> str:
+def describe_worst(worst: WorstMisfit) -> str:
     """Describe the worst place of a verdict: where, by how much, in multiples of the noise."""
-    symbol, unit = CHANNEL_SYMBOLS[worst["channel"]]
+    symbol, unit = CHANNEL_SYMBOLS[worst.channel]
     parts = []
-    if worst["step"] is not None:
-        parts.append(f"{worst['frequency_hz']:g} Hz {worst['direction']}, step {worst['step'] + 1}")
-    phase = str(worst["phase"]).replace("_", " ")
+    if worst.step is not None:
+        parts.append(f"{worst.frequency_hz:g} Hz {worst.direction}, step {worst.step + 1}")
+    phase = worst.phase.replace("_", " ")
     parts.append(f"{symbol} {f'in {phase}' if phase else ''}".strip())
-    if worst["error"] is not None:
-        parts.append(f"misfit {format_quantity(worst['error'], unit)} rms")
-    if worst["misfit"] is not None:
-        parts.append(f"{worst['misfit']:.3g} times the noise")
-    return ", ".join([*parts, f"{worst['share']:.2g} times the tolerance"])
+    if worst.error is not None:
+        parts.append(f"misfit {format_quantity(worst.error, unit)} rms")
+    if worst.misfit is not None:
+        parts.append(f"{worst.misfit:.3g} times the noise")
+    return ", ".join([*parts, f"{worst.share:.2g} times the tolerance"])
 
 
-def format_jump(jump: Mapping[str, Any]) -> str:
+def format_jump(jump: Jump) -> str:
     """Format a jump as direction, kind and the grid frequencies that it lies between."""
-    return f"{jump['direction']} jump {jump['kind']}, {jump['from_hz']:g} to {jump['to_hz']:g} Hz"
+    return f"{jump.direction} jump {jump.kind}, {jump.from_hz:g} to {jump.to_hz:g} Hz"

@@ -1,7 +1,6 @@
 """Results of a displacement history by windows in time: peaks, rms, impacts and twin errors."""
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -10,21 +9,21 @@ from table_io.channels import contact_forces, relative_displacement
 from table_io.records import Comparison
 from twin.compare.cycles import detect_onsets
 from twin.recording.reader import Recording
+from twin.results.contracts import ChannelError, MotionResult, PeakAndRms, WindowResult
 from twin.results.rerun import restore_predictions
 
-Json = dict[str, Any]
-CompareChannels = Callable[[tuple[Comparison, ...]], Json]  # NRMSE by channel
+CompareChannels = Callable[[tuple[Comparison, ...]], dict[str, ChannelError]]
 
 
 def summarise_windows(
     recording: Recording, contact_n: float, compare: CompareChannels
-) -> list[Json]:
-    """Return the entry of each window that was played, SI; "twin" is the free-running one."""
+) -> list[WindowResult]:
+    """Return the results of each window that was played, SI; "twin" is the free-running one."""
     recording = restore_predictions(recording)
     measured, predicted = (recording.contiguous_blocks(name) for name in ("meas", "pred"))
     comparisons = recording.records(Comparison)
     rate_hz = recording.start.rate_hz
-    entries = []
+    windows = []
     for number, (first, end) in find_windows(measured).items():
         inside = tuple(
             comparison
@@ -32,24 +31,21 @@ def summarise_windows(
             if first <= comparison.index and comparison.index + comparison.count <= end
         )
         blocks = cut_blocks(measured, first, end)
-        entries.append(
-            {
-                "index": number,
-                "from_s": first / rate_hz,
-                "to_s": end / rate_hz,
-                "table_disp": _peak_and_rms(join_channel(blocks, "table_disp_m")),
-                "table_acc": _peak_and_rms(join_channel(blocks, "table_acc_m_s2")),
-                "measured": _describe_motion(blocks, contact_n)
-                if recording.start.source == "table"
-                else None,
-                "twin": _describe_motion(
-                    [extract_free_twin(block) for block in cut_blocks(predicted, first, end)],
-                    contact_n,
-                ),
-                "comparison": compare(inside),
-            }
+        twin_blocks = [extract_free_twin(block) for block in cut_blocks(predicted, first, end)]
+        is_measured = recording.start.source == "table"
+        windows.append(
+            WindowResult(
+                index=number,
+                from_s=first / rate_hz,
+                to_s=end / rate_hz,
+                table_disp=_find_peak_and_rms(join_channel(blocks, "table_disp_m")),
+                table_acc=_find_peak_and_rms(join_channel(blocks, "table_acc_m_s2")),
+                measured=_describe_motion(blocks, contact_n) if is_measured else None,
+                twin=_describe_motion(twin_blocks, contact_n),
+                comparison=compare(inside),
+            )
         )
-    return entries
+    return windows
 
 
 def find_windows(blocks: tuple[Block, ...]) -> dict[int, tuple[int, int]]:
@@ -91,29 +87,29 @@ def join_channel(blocks: list[Block], name: str) -> Float1D:
     return np.concatenate([np.empty(0), *parts])
 
 
-def _peak_and_rms(values: Float1D) -> Json:
+def _find_peak_and_rms(values: Float1D) -> PeakAndRms:
     """Return the largest magnitude and the rms of the known samples; None if none is known."""
     known = values[np.isfinite(values)]
     if not known.size:
-        return {"peak": None, "rms": None}
-    return {"peak": float(np.abs(known).max()), "rms": float(np.sqrt(np.mean(known**2)))}
+        return PeakAndRms(peak=None, rms=None)
+    return PeakAndRms(peak=float(np.abs(known).max()), rms=float(np.sqrt(np.mean(known**2))))
 
 
-def _describe_motion(blocks: list[Block], contact_n: float) -> Json | None:
+def _describe_motion(blocks: list[Block], contact_n: float) -> MotionResult | None:
     """Return peak and rms of u, a and the contact forces, and the impacts on either side."""
     if not blocks:
         return None
     forces = [contact_forces(block) for block in blocks]
     right = np.concatenate([force for force, _ in forces])
     left = -np.concatenate([force for _, force in forces])
-    return {
-        "u": _peak_and_rms(np.concatenate([relative_displacement(block) for block in blocks])),
-        "a": _peak_and_rms(join_channel(blocks, "mass_acc_m_s2")),
-        "force_r": _peak_and_rms(right),
-        "force_l": _peak_and_rms(left),
-        "impacts_right": _count_impacts(right, contact_n),
-        "impacts_left": _count_impacts(left, contact_n),
-    }
+    return MotionResult(
+        u=_find_peak_and_rms(np.concatenate([relative_displacement(block) for block in blocks])),
+        a=_find_peak_and_rms(join_channel(blocks, "mass_acc_m_s2")),
+        force_r=_find_peak_and_rms(right),
+        force_l=_find_peak_and_rms(left),
+        impacts_right=_count_impacts(right, contact_n),
+        impacts_left=_count_impacts(left, contact_n),
+    )
 
 
 def _count_impacts(force: Float1D, contact_n: float) -> int | None:

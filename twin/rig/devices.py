@@ -52,9 +52,9 @@ def print_devices(ni: str | None, as_json: bool) -> None:
         if not (name in rig_searches and isinstance(replies[name], InputError))
     }
     if as_json:
-        from twin.results.summary import dump_strict_json  # slow import
+        from twin.results.contract import format_json  # slow import
 
-        print(dump_strict_json(_to_json(statuses, discovered)))
+        print(format_json(_to_json(statuses, discovered)))
     else:
         _print_tables(statuses, discovered)
 

@@ -9,7 +9,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from table_io.safety.wiring_check import CheckLine, RestingInputs
-from twin.results.summary import dump_strict_json
+from twin.results.contract import format_json
 from twin.rig.check_table import EXIT_FAILED, WiringCheckResult, check_table
 from twin.system.terminal import console, print_line, print_table
 
@@ -39,7 +39,7 @@ class TerminalOperator:
 def print_wiring_result(result: WiringCheckResult, as_json: bool) -> None:
     """Print the inputs at rest, the checks, warnings and the verdict, or all as JSON."""
     if as_json:
-        print(dump_strict_json(_to_json(result)))
+        print(format_json(_to_json(result)))
         return
     if result.resting is not None:
         print_table(console, _make_inputs_table(result.resting))

@@ -16,7 +16,7 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import RangeExit, select_first_exits
 from twin.results import ideal_points
-from twin.results.summary import Json
+from twin.results.contract import Json
 from twin.studies.cases import StudyCase, build_cases
 from twin.studies.rows import Row, make_rows
 

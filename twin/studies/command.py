@@ -12,7 +12,7 @@ from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 from twin.model.valid_range import RangeKey
 from twin.report.finalize import EXIT_INTERRUPTED
-from twin.results.summary import Json, write_json
+from twin.results.contract import Json, write_json
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.warm_up import COMPILING_MESSAGE

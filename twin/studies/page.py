@@ -4,19 +4,19 @@ import math
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel
-
 from twin.drawing.page import embed_images, render_page
-from twin.results.summary import load_summary
+from twin.results.contract import Contract
 from twin.studies import TABLE_FILE
 from twin.studies.cases import format_gap_mm
 from twin.studies.rows import read_batch_rows
 
 
-class BatchSummary(BaseModel):
-    """Keys that every summary.json of a batch has; it may have more."""
+class BatchSummary(Contract):
+    """Keys that every summary.json of a batch has."""
 
     run: dict[str, Any]
+    verdict: str
+    reason: str
     models: dict[str, Any]
     cases: list[dict[str, Any]]
 
@@ -26,7 +26,7 @@ def write_study_page(folder: Path) -> Path:
     from twin.studies.figures import draw_study_figures
 
     remedy = "give a folder written by simulate"
-    summary = load_summary(folder / "summary.json", BatchSummary, remedy)
+    summary = BatchSummary.read(folder / "summary.json", remedy).to_plain()
     pictures = draw_study_figures(read_batch_rows(folder / TABLE_FILE), summary, folder / "figures")
     path = folder / "report.html"
     text = render_page(

@@ -45,7 +45,7 @@ from twin.discovery.loading import load_recordings
 from twin.discovery.parameters import GapKey
 from twin.discovery.signals import LogSignals
 from twin.model.model import Model
-from twin.results.summary import dump_strict_json
+from twin.results.contract import format_json
 from twin.setup.run_config import read_model_template
 from twin.system.terminal import print_line
 
@@ -110,7 +110,7 @@ def evaluate_case(root: Path, number: int, method: Method | None = None) -> Json
         "label": case.label, "seconds": cpu_seconds() - made_s, "made_in": made_s - start_s,
         **({"failed": failure} if failure else {}),
     }  # fmt: skip
-    paths.verdict.write_text(dump_strict_json(verdict), encoding="utf-8")
+    paths.verdict.write_text(format_json(verdict), encoding="utf-8")
     if about["kind"] == "identify":
         return score_identification(verdict, about) | timing
     if "laboratory" in about:  # which oracle and rivals do not know
