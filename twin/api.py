@@ -15,8 +15,8 @@ folder `runs/<date>-<time>-<name>` is made.
 
 from pathlib import Path
 
-from table_io.config.folders import resolve_config
 from table_io.errors import InputError
+from twin.branches.task import BranchOptions, FollowedBranches, follow_branches
 from twin.discovery.decide import DecidedTests, decide
 from twin.discovery.decisive_test import DecideOptions
 from twin.discovery.features.task import FeatureModel, discover_features
@@ -24,10 +24,16 @@ from twin.discovery.result import FeatureVerdict, IdentificationReport, Interval
 from twin.discovery.task import DiscoveredModel, FittedModel, discover, identify
 from twin.earthquakes.result import DriveResult, TableTwinResult
 from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
-from twin.exchange.import_table import ImportOptions, import_table
+from twin.exchange.drive_file import DriveOptions, ExportedDrive, export_drive
+from twin.exchange.export import Exported, ExportOptions, export_log
+from twin.exchange.import_table import Imported, ImportOptions, import_data, import_table
 from twin.log import Log, open_log
 from twin.replay.pipeline_replay import RecordedRun, SampleRange, replay_recording
+from twin.replay.verify import Verification, repair_log, verify
 from twin.results.recordings import read_recorded_config
+from twin.rig.calibrate import CalibratedSensor, CalibrationOptions, calibrate
+from twin.rig.check import CheckedTest, check_test
+from twin.rig.check_table import WiringCheckResult, check_table
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced, simulate_ideal
@@ -35,14 +41,25 @@ from twin.setup.warm_up import compile_kernels
 from twin.studies.maps.results import open_study
 
 __all__ = [
+    "BranchOptions",
+    "CalibratedSensor",
+    "CalibrationOptions",
+    "CheckedTest",
     "DecideOptions",
     "DecidedTests",
     "DiscoveredModel",
+    "DriveOptions",
     "DriveResult",
+    "ExportOptions",
+    "Exported",
+    "ExportedDrive",
     "FeatureModel",
     "FeatureVerdict",
     "FittedModel",
+    "FollowedBranches",
     "IdentificationReport",
+    "ImportOptions",
+    "Imported",
     "InputError",
     "Interval",
     "Log",
@@ -50,18 +67,29 @@ __all__ = [
     "TableTwinOptions",
     "TableTwinResult",
     "Verdict",
+    "Verification",
+    "WiringCheckResult",
+    "calibrate",
+    "check_table",
+    "check_test",
     "compute_drive",
     "decide",
     "discover",
     "discover_features",
+    "export_drive",
+    "export_log",
+    "follow_branches",
     "identify",
     "identify_table",
     "import_data",
+    "import_table",
     "open_log",
     "open_study",
+    "repair_log",
     "replay",
     "run_simulated",
     "simulate",
+    "verify",
 ]
 
 PathLike = str | Path
@@ -121,27 +149,6 @@ def replay(log: PathLike, out: PathLike | None = None, model: PathLike | None = 
     span = SampleRange.all_samples(recording)
     replay_recording(recorded, config, folder / LOG_FILE, run, lambda _: None, span)
     return open_log(folder)
-
-
-def import_data(
-    file: PathLike,
-    out: PathLike,
-    columns: PathLike | None = None,
-    profile: PathLike | None = None,
-) -> Log:
-    """Import a table of samples (CSV, xlsx, Parquet, MAT, ...) to the new log `out`; return it.
-
-    `columns` is the file of a column map; without it the proposed map is taken, whose units and
-    channels are in the log's events. `profile` states specimen, gaps and steps. InputError where
-    the file leaves a question open, or `out` exists.
-    """
-    options = ImportOptions(
-        profile=None if profile is None else resolve_config(Path(profile), "tests"),
-        columns=None if columns is None else Path(columns),
-        accept=columns is None,
-    )
-    import_table(Path(file), Path(out), options)
-    return open_log(out)
 
 
 def _as_name(name: PathLike | None) -> str | None:

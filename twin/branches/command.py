@@ -11,13 +11,13 @@ from twin.system.terminal import announce_if_slow, console, print_line
 
 def show_branches(options: BranchOptions) -> None:
     """Follow the branches, print their bifurcations and the page of the report."""
-    found = follow_branches(options, announce_if_slow)
-    if found.resonance is not None:
-        print_line(f"{format_map_headline(found.resonance)} -> {found.page}")
-    if found.branches is not None:
-        print_bifurcations(found.branches)
-        count = len(found.branches.branches)
-        print_line(f"{count} branch{'es' if count != 1 else ''} -> {found.page}")
+    followed = follow_branches(options, announce_if_slow)
+    if followed.resonance is not None:
+        print_line(f"{format_map_headline(followed.resonance)} -> {followed.page}")
+    if followed.branches is not None:
+        print_bifurcations(followed.branches)
+        count = len(followed.branches.branches)
+        print_line(f"{count} branch{'es' if count != 1 else ''} -> {followed.page}")
 
 
 def print_bifurcations(branches: BranchSet) -> None:

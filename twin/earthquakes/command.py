@@ -14,9 +14,9 @@ from twin.earthquakes.result import PROFILE_FILE, DriveResult, TableTwinResult
 from twin.earthquakes.table_effects import LIBRARY, describe_discovery
 from twin.earthquakes.table_model import TableParameters
 from twin.earthquakes.task import (
-    DriveComputation,
     TableDriveOptions,
     TableTwinOptions,
+    compute_drive,
     identify_table,
     prepare_drive_computation,
 )
@@ -84,8 +84,7 @@ def compute_drive_command(
 ) -> int:
     """Write a profile with the drive for its target; with iterations, run it and correct it."""
     with show_status("computing the drive on the twin of the table") as show_part:
-        computation = prepare_drive_computation(options, show_part)
-        drive = computation.compute(options.after, show_part)
+        drive = compute_drive(options, show_part)
     for note in drive.notes:
         print_line(f"warning: {note}")
     if drive.expected_error is not None:
@@ -95,13 +94,14 @@ def compute_drive_command(
         written = drive.save(folder)
         print_line(f"{written}; next: shaketwin run {written}")
         return 0
-    return _iterate(computation, drive, folder, iterations, unpaced)
+    return _iterate(options, drive, folder, iterations, unpaced)
 
 
 def _iterate(
-    computation: DriveComputation, drive: DriveResult, folder: Path, iterations: int, unpaced: bool
+    options: TableDriveOptions, drive: DriveResult, folder: Path, iterations: int, unpaced: bool
 ) -> int:
     """Run the drive and correct it, until the error grows; return the exit code."""
+    computation = prepare_drive_computation(options)
     rows = Table("run", "rms error", "peak ratio", "SA within 10 %", title="iteration, in the band")
     errors: list[float] = []
     for number in range(iterations + 1):

@@ -3,12 +3,14 @@
 import shlex
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from rich.markup import escape
 from rich.table import Table
 
+from table_io.config.folders import resolve_config
 from table_io.errors import InputError
 from table_io.formats import read_table
 from table_io.records import RunStart
@@ -27,6 +29,8 @@ def run_import(
     files: Sequence[Path], out: Path | None, save_map: Path | None, options: ImportOptions
 ) -> int:
     """Import the files, or propose a map if no log is named; return the exit code."""
+    if options.profile is not None:
+        options = replace(options, profile=resolve_config(options.profile, "tests"))
     if out is None and options.columns is None:
         _propose(files, save_map, options)
         return 0

@@ -13,7 +13,7 @@ import numpy as np
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.config.base import load_config, parse_toml
 from table_io.config.channel import read_channels
-from table_io.config.folders import find_config
+from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
@@ -30,6 +30,7 @@ from twin.exchange.columns import (
 )
 from twin.exchange.labels import read_labels, typical_cycles
 from twin.exchange.proposal import MapProposal, propose_map
+from twin.log import Log, open_log
 from twin.setup.run_config import RunConfig, from_texts, make_run_id, read_model
 from twin.setup.unpaced import SIMULATED_BLOCK_SAMPLES, add_twin_items, record_items
 from twin.setup.warm_up import compile_kernels
@@ -196,6 +197,27 @@ def import_table(
     out.parent.mkdir(parents=True, exist_ok=True)
     record_items(items, out, run, samples.rate_hz, count_gaps)
     return Imported(out, grid.size, grid.channels, gaps, notes)
+
+
+def import_data(
+    file: str | Path,
+    out: str | Path,
+    columns: str | Path | None = None,
+    profile: str | Path | None = None,
+) -> Log:
+    """Import a table of samples (CSV, xlsx, Parquet, MAT, ...) to the new log `out`; open it.
+
+    `columns` is the file of a column map; without it the proposed map is taken, whose units and
+    channels are in the log's events. `profile` states specimen, gaps and steps. InputError where
+    the file leaves a question open, or `out` exists.
+    """
+    options = ImportOptions(
+        profile=None if profile is None else resolve_config(Path(profile), "tests"),
+        columns=None if columns is None else Path(columns),
+        accept=columns is None,
+    )
+    import_table(Path(file), Path(out), options)
+    return open_log(out)
 
 
 def propose_import(file: Path, options: ImportOptions) -> MapProposal:

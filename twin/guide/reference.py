@@ -29,10 +29,6 @@ CONFIG_FILES: tuple[tuple[str, str, type[ConfigModel]], ...] = (
 )
 
 PACKAGES_DIR = Path(__file__).resolve().parents[2]  # holds twin and table_io
-PUBLIC_FUNCTIONS = (
-    "open_log", "run_simulated", "simulate", "replay", "import_data", "identify", "discover",
-    "open_study",
-)  # fmt: skip
 
 
 def format_table(header: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
@@ -129,39 +125,51 @@ def write_api_reference(_: TyperGroup) -> str:
 
     It is parsed, not imported: the import would compile kernels.
     """
-    modules = [
-        ast.parse((PACKAGES_DIR / name).read_text(encoding="utf-8"))
-        for name in (
-            "twin/api.py",
-            "twin/log/__init__.py",
-            "twin/studies/maps/results.py",
-            "twin/discovery/task.py",
-        )
-    ]
-    nodes = {
-        node.name: node
-        for module in modules
-        for node in module.body
-        if isinstance(node, ast.FunctionDef | ast.ClassDef)
-    }
-    summary, example, notes = (ast.get_docstring(modules[0]) or "").split("\n\n", 2)
+    interface = _parse_module("twin.api")
+    nodes = {getattr(node, "name", ""): node for node in interface.body}
+    for statement in interface.body:
+        if isinstance(statement, ast.ImportFrom) and str(statement.module).startswith(
+            ("table_io.", "twin.")
+        ):
+            known = {getattr(n, "name", ""): n for n in _parse_module(str(statement.module)).body}
+            nodes |= {alias.name: known[alias.name] for alias in statement.names}
+    public = [nodes[name] for name in list_public_names(interface)]
+    summary, example, notes = (ast.get_docstring(interface) or "").split("\n\n", 2)
     parts = [
         "# Python API",
         summary,
         f"```python\n{example.replace('>>> ', '')}\n```",
         notes,
     ]
-    for name in PUBLIC_FUNCTIONS:
-        parts += _describe_function(nodes[name])
-    parts += ["## Log", (ast.get_docstring(modules[1]) or "").split("\n\n", 2)[2]]
-    for name in ("FittedModel", "DiscoveredModel"):
-        parts += [f"## {name}", ast.get_docstring(nodes[name]) or ""]
+    for node in public:
+        if isinstance(node, ast.FunctionDef):
+            parts += _describe_function(node)
+    log_page = ast.get_docstring(_parse_module("twin.log")) or ""
+    parts += ["## Log", log_page.split("\n\n", 2)[2]]
+    for node in public:
+        if isinstance(node, ast.ClassDef) and node.name != "Log":
+            parts += [f"## {node.name}", ast.get_docstring(node) or ""]
     return "\n\n".join(parts)
+
+
+def list_public_names(module: ast.Module) -> list[str]:
+    """Return the names in `__all__` of a module."""
+    for node in module.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            return [*ast.literal_eval(node.value)]
+    return []
+
+
+def _parse_module(name: str) -> ast.Module:
+    path = PACKAGES_DIR / name.replace(".", "/")
+    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    return ast.parse(file.read_text(encoding="utf-8"))
 
 
 def _describe_function(node: Any) -> Iterator[str]:
     """Yield the parts of the section of a function."""
-    arguments = ast.unparse(node.args).replace("PathLike", "str | Path").replace("=", " = ")
+    arguments = ast.unparse(node.args).replace("PathLike", "str | Path")
+    arguments = arguments.replace("=", " = ")
     lines = "".join(f"    {argument},\n" for argument in arguments.split(", "))
     yield f"## {node.name}"
     result = ast.unparse(node.returns).strip("'")

@@ -1,0 +1,178 @@
+"""A task is one function: the API is what the commands call, and returns what they write."""
+
+import ast
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from table_io.config.base import PROFILES_DIR
+from table_io.config.provenance import Provenance
+from table_io.config.toml_text import format_toml
+from tests.command_line import call_main
+from twin import api
+from twin.cli.table import COMMANDS
+from twin.results.contract import format_json
+from twin.system.files import hash_file
+
+ROOT = Path(__file__).resolve().parents[2]
+# The tasks of each command that computes.
+TASKS = {
+    "branches": ("follow_branches",),
+    "calibrate": ("calibrate",),
+    "check": ("check_test", "check_table"),
+    "discover": ("discover", "discover_features", "decide"),
+    "drive": ("export_drive",),
+    "export": ("export_log",),
+    "identify": ("identify",),
+    "import": ("import_table",),
+    "table-drive": ("compute_drive",),
+    "table-twin": ("identify_table",),
+    "verify": ("verify", "repair_log"),
+}
+
+
+def list_called_names(module: str) -> set[str]:
+    """Return the names of twin that the modules of a command's room import or define."""
+    folder = (ROOT / module.replace(".", "/")).parent
+    trees = [ast.parse(path.read_text()) for path in folder.glob("*.py")]
+    return {
+        node.func.id
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
+    }
+
+
+@pytest.mark.parametrize("command", TASKS)
+def test_a_command_calls_the_function_of_the_api(command: str) -> None:
+    """Which is defined once, in the rooms, and never in `twin.api`."""
+    (row,) = (row for row in COMMANDS if row.name == command)
+    room = row.target.partition(":")[0].rpartition(".")[0]
+    for name in TASKS[command]:
+        task = getattr(api, name)
+        assert name in api.__all__
+        assert task.__module__.startswith(f"{room}.")
+        assert name in list_called_names(row.target.partition(":")[0])
+
+
+def read_json(path: Path) -> dict[str, object]:
+    """Return the content of a JSON file without what a clock measured."""
+    content: dict[str, object] = json.loads(path.read_text())
+    return content | {"seconds": 0}
+
+
+def compare_branches(log: Path, folder: Path) -> tuple[object, object]:
+    words = ("--from", 3.0, "--to", 3.2, "--out", folder / "shell")
+    assert call_main("branches", "quickstart", *words).returncode == 0
+    api.follow_branches(api.BranchOptions("quickstart", low=3.0, high=3.2, out=folder / "python"))
+    returned, written = (folder / name / "branches.json" for name in ("python", "shell"))
+    return returned.read_text(), written.read_text()
+
+
+def compare_drives(log: Path, folder: Path) -> tuple[object, object]:
+    assert call_main("drive", "quickstart", "-o", folder / "shell.csv").returncode == 0
+    profile = PROFILES_DIR / "tests" / "quickstart.toml"
+    api.export_drive(api.DriveOptions(profile, folder / "python.csv"))
+    return (folder / "python.csv").read_text(), (folder / "shell.csv").read_text()
+
+
+def compare_exports(log: Path, folder: Path) -> tuple[object, object]:
+    words = ("--csv", "--channel", "rel_disp_m", "--steps", "1:2", "-o", folder / "shell")
+    assert call_main("export", log, *words).returncode == 0
+    options = api.ExportOptions(log, ("csv",), folder / "python", ("rel_disp_m",), (1, 2))
+    assert api.export_log(options).rows > 1000
+    return (folder / "python.csv").read_text(), (folder / "shell.csv").read_text()
+
+
+def compare_fits(log: Path, folder: Path) -> tuple[object, object]:
+    assert call_main("identify", log, "--out", folder / "shell.toml").returncode == 0
+    fitted = api.identify([log])
+    fitted.save_model(folder / "python.toml")
+    report = json.loads(fitted.report.to_json()) | {"seconds": 0}
+    written = read_json(folder / "shell" / "identify.json")
+    return (
+        ((folder / "python.toml").read_text(), report),
+        ((folder / "shell.toml").read_text(), written),
+    )
+
+
+def compare_imports(log: Path, folder: Path) -> tuple[object, object]:
+    api.export_log(api.ExportOptions(log, ("csv",), folder / "table"))
+    words = ("--accept", "--profile", "quickstart", "-o", folder / "shell.mcap")
+    result = call_main("import", folder / "table.csv", *words)
+    assert result.returncode == 0, result.stderr
+    imported = api.import_data(folder / "table.csv", folder / "python.mcap", profile="quickstart")
+    other = api.open_log(folder / "shell.mcap")
+    assert imported.start.steps == other.start.steps
+    return imported.predicted.tobytes(), other.predicted.tobytes()
+
+
+def compare_plans(log: Path, folder: Path) -> tuple[object, object]:
+    """Of a test whose model was identified at another mass."""
+    text = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    provenance = Provenance(masses_kg=(700.0,), gaps_mm=(4.0,))
+    (folder / "model.toml").write_text(text + format_toml({"provenance": provenance.model_dump()}))
+    profile = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()
+    (folder / "test.toml").write_text(profile.replace('"snm"', '"model.toml"'))
+    checked = api.check_test(folder / "test.toml")
+    assert any("700 kg, the test has 550 kg" in warning for warning in checked.warnings)
+    lines = call_main("check", folder / "test.toml").stdout.splitlines()
+    shown = [line.partition(": ")[2] for line in lines if line.startswith("warning: ")]
+    return [*checked.warnings], shown
+
+
+def compare_repairs(log: Path, folder: Path) -> tuple[object, object]:
+    (folder / "cut.mcap").write_bytes(log.read_bytes()[:-20_000])
+    words = ("--repair", folder / "shell.mcap")
+    assert call_main("verify", folder / "cut.mcap", *words).returncode == 4
+    api.repair_log(api.verify(folder / "cut.mcap"), folder / "python.mcap")
+    repaired, other = (api.open_log(folder / f"{name}.mcap") for name in ("python", "shell"))
+    assert repaired.start == other.start
+    return repaired["mass_disp_m"].tobytes(), other["mass_disp_m"].tobytes()
+
+
+def compare_verifications(log: Path, folder: Path) -> tuple[object, object]:
+    result = call_main("verify", log, "--json")
+    assert result.returncode == 0
+    return format_json(asdict(api.verify(log).report)), result.stdout.rstrip("\n")
+
+
+def compare_wirings(log: Path, folder: Path) -> tuple[object, object]:
+    shown = json.loads(call_main("check", "--table", "simulated", "--json").stdout)["lines"]
+    lines = api.check_table("simulated").lines
+    return [(line.name, line.channel, line.verdict) for line in lines], [
+        (line["name"], line["channel"], line["verdict"]) for line in shown
+    ]
+
+
+@pytest.mark.parametrize(
+    "compare",
+    [
+        compare_branches,
+        compare_drives,
+        compare_exports,
+        compare_fits,
+        compare_imports,
+        compare_plans,
+        compare_repairs,
+        compare_verifications,
+        compare_wirings,
+    ],
+)
+def test_a_task_returns_what_its_command_writes(
+    compare: Callable[[Path, Path], tuple[object, object]], log_file: Path, tmp_path: Path
+) -> None:
+    returned, written = compare(log_file, tmp_path)
+    assert returned == written
+    assert returned
+
+
+def test_an_identified_model_states_its_recordings(log_file: Path) -> None:
+    fitted = api.identify([log_file])
+    log = api.open_log(log_file)
+    source = f'sha256 = "{hash_file(log_file)}"'
+    assert source in fitted.model_toml
+    assert f"masses_kg = [{log.profile.specimen.mass_kg}]" in fitted.model_toml
