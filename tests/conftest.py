@@ -1,13 +1,24 @@
-"""One thread for matrices, as in a run; more time for long studies; fixtures of the builders."""
+"""One thread for matrices, as in a run; coarse pictures; more time for long studies; fixtures."""
 
 import os
+import runpy
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from hypothesis import settings
 
 # Before anything is imported that computes; so whatever does is imported where it is needed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# Drawing was a fifth of the time of all tests. So every line is drawn, but coarsely and without
+# ticks, here and in the processes that tests start. `full_quality` is for tests of the pictures.
+DRAFT_SITE = Path(__file__).parent / "draft"
+if "--benchmark-only" not in sys.argv and str(DRAFT_SITE) not in os.environ.get("PYTHONPATH", ""):
+    paths = (str(DRAFT_SITE), os.environ.get("PYTHONPATH"))
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
+    runpy.run_path(str(DRAFT_SITE / "sitecustomize.py"))
 
 pytest_plugins = ["tests.builders.recordings", "tests.reports.folders"]
 settings.register_profile("any machine", deadline=None)  # no test needs a quiet one

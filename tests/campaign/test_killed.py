@@ -86,7 +86,7 @@ class Both:
 
 
 @pytest.fixture(scope="module")
-def both(tmp_path_factory: pytest.TempPathFactory, draft_path: str) -> Both:
+def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
     for name, values in TESTS.items():
         (folder / f"{name}.toml").write_text(TEST.format(name=name, **values))
@@ -104,21 +104,18 @@ def both(tmp_path_factory: pytest.TempPathFactory, draft_path: str) -> Both:
         )
     share = random.uniform(0.2, 0.95)
     size = (whole / "02-g4" / "run.mcap").stat().st_size
-    environment = {**os.environ, "PYTHONPATH": draft_path}  # pictures are not what is tried here
     command = [SHAKETWIN, "campaign", str(folder / "c.toml"), "--speed", "max"]
     command += ["--out", str(killed)]
-    _kill(command, environment, killed / "02-g4" / "run.mcap", share * size)
+    _kill(command, killed / "02-g4" / "run.mcap", share * size)
     left = {log.parent.name: log.read_bytes() for log in killed.rglob("run.mcap")}
-    done = subprocess.run(
-        [*command, "--resume"], env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([*command, "--resume"], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return Both(whole, killed, share, left, done.stdout)
 
 
-def _kill(command: list[str], environment: dict[str, str], log: Path, size: float) -> None:
+def _kill(command: list[str], log: Path, size: float) -> None:
     """Start a campaign, and kill it and all that it started once the log is so large."""
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     while process.poll() is None and not (log.exists() and log.stat().st_size >= size):
         time.sleep(0.01)
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()

@@ -163,7 +163,9 @@ def test_a_sensor_that_the_model_drives_out_of_range_is_warned_of_not_refused() 
     ],
     ids=["plain", "sweep alone", "one step"],
 )
-def test_the_drawing_shows_every_kind_of_drive(test: str, tmp_path: Path) -> None:
+def test_the_drawing_shows_every_kind_of_drive(
+    test: str, tmp_path: Path, full_quality: None
+) -> None:
     picture = imread(draw_drive(bundle(test), tmp_path / "drive.png"))
     assert picture.shape[0] > 1000
     assert picture.shape[1] > 1000

@@ -30,8 +30,6 @@ cycles = 4
 measured_cycles = 2
 """
 
-pytestmark = pytest.mark.usefixtures("drafts")
-
 
 def shaketwin(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     return subprocess.run(

@@ -275,11 +275,9 @@ def test_a_difference_that_fades_on_a_steep_flank_is_no_hysteresis() -> None:
     assert detect_hysteresis(points, "measured") == ([], [])
 
 
-@pytest.mark.parametrize("seed", range(100))
 @pytest.mark.parametrize("noise", [0.002, 0.03, 0.15])
-def test_noise_of_a_healthy_sweep_is_no_hysteresis_of_eta_a(seed: int, noise: float) -> None:
+def test_noise_of_a_healthy_sweep_is_no_hysteresis_of_eta_a(noise: float) -> None:
     """Three noisy cycles a point, and a grazing contact that is counted or not."""
-    rng = np.random.default_rng(seed)
 
     def noisy(hz: float) -> NormalizedResponse:
         eta_d = 0.1 * hz * (1 + 0.1 * noise * rng.standard_normal(3))
@@ -289,7 +287,9 @@ def test_noise_of_a_healthy_sweep_is_no_hysteresis_of_eta_a(seed: int, noise: fl
             float(np.ptp(eta_a) / eta_a.mean()), tuple(rng.integers(1, 3, 3).tolist()),
         )  # fmt: skip
 
-    assert detect_hysteresis(both(noisy, noisy), "measured") == ([], [])
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        assert detect_hysteresis(both(noisy, noisy), "measured") == ([], []), seed
 
 
 # The model's own sweeps: ten cycles a step, the last three measured

@@ -38,7 +38,7 @@ def test_the_response_of_a_known_table() -> None:
     assert hz.max() < 26.0  # nothing was played above
 
 
-def test_the_figure_is_drawn(tmp_path: Path) -> None:
+def test_the_figure_is_drawn(tmp_path: Path, full_quality: None) -> None:
     draw_table_twin(TableModel(2000.0), make_rehearsal(), "Table", tmp_path / "table.png")
     pixels = np.asarray(Image.open(tmp_path / "table.png").convert("L"))
     assert pixels.shape[1] > 1000

@@ -103,7 +103,7 @@ def test_prc_of_an_import_is_that_of_the_run(
 
 
 def test_prc_and_replay_read_an_imported_log(
-    imported_log: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str], draft: None
+    imported_log: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     print_recording_prc(imported_log.path, True)
     assert '"frequency_hz": 3.6' in capsys.readouterr().out
@@ -115,7 +115,7 @@ def test_prc_and_replay_read_an_imported_log(
 
 
 def test_import_table_with_the_sweep_of_another_profile(
-    run: tuple[Path, Recording], tmp_path: Path, draft: None
+    run: tuple[Path, Recording], tmp_path: Path
 ) -> None:
     profile = tmp_path / "other.toml"
     profile.write_text(SHORT.replace("start_hz = 3.6", "start_hz = 1.0").replace("0.2", "1.7"))
@@ -195,7 +195,7 @@ def test_import_table_takes_the_rate_of_the_file(
 
 
 def test_import_table_of_an_export_is_identical(
-    run: tuple[Path, Recording], tmp_path: Path, draft: None
+    run: tuple[Path, Recording], tmp_path: Path
 ) -> None:
     export_log(ExportOptions(run[1].path, ("parquet",), tmp_path / "out"))
     assert import_table(tmp_path / "out.parquet", tmp_path / "again.mcap").gaps == 0
@@ -295,7 +295,7 @@ def open_dataset(name: str) -> Path:
     return path
 
 
-def test_import_table_of_an_earthquake_has_no_steps(tmp_path: Path, draft: None) -> None:
+def test_import_table_of_an_earthquake_has_no_steps(tmp_path: Path) -> None:
     log = tmp_path / "b" / "run.mcap"
     assert import_table(open_dataset("bncs/CNP100.csv"), log).gaps == 0
     recording = read_recording(log)

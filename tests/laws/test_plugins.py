@@ -250,7 +250,6 @@ def test_a_bumper_law_that_the_solver_cannot_integrate_is_refused(force, words):
     assert words in str(caught.value)
 
 
-@pytest.mark.usefixtures("drafts")
 class RateWitness(Witness):
     """Bumpers with a further push of their rate alone, whose free face moves without force."""
 

@@ -36,8 +36,6 @@ directions = ["forward"]
 """
 QUICK = f"{PROFILE}[loop_check]\nenabled = false\n"  # the processes are the same, 15 s sooner
 
-pytestmark = pytest.mark.usefixtures("drafts")
-
 
 def start(folder: Path, *options: str, profile: str = QUICK) -> subprocess.Popen[str]:
     """A live run of the short test that writes to folder/out.
@@ -207,6 +205,7 @@ def test_a_dead_twin_is_a_fault_a_dead_recorder_no_gap_and_a_dead_viewer_nothing
     assert "identical to the bit" in again.stdout
 
 
+@pytest.mark.slow  # 25 s
 def test_fault_of_a_dead_twin_reaches_a_recorder_started_after_the_run(
     tmp_path: Path,
 ) -> None:

@@ -40,8 +40,6 @@ file = "orbits.json"
 """
 CAPTURE_S = 4.0  # from the start of the excitation: the feedback acts
 
-pytestmark = pytest.mark.usefixtures("drafts")
-
 
 @pytest.mark.slow  # 20 s
 def test_an_orbit_is_held_on_though_the_twin_dies(tmp_path: Path) -> None:

@@ -23,8 +23,6 @@ from twin.system.terminal import STOP_SIGNALS, catch_interrupts
 
 PAUSE_S = 7.0  # longer than the supervisor waits for a silent rig
 
-pytestmark = pytest.mark.usefixtures("drafts")
-
 
 @pytest.mark.parametrize("name", STOP_SIGNALS)
 def test_every_stop_signal_is_a_reason_to_stop(name: str) -> None:

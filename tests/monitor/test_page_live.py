@@ -12,7 +12,7 @@ from tests.monitor.browser import Browser, open_browser
 from tests.security.laboratory import laboratory
 from twin.rig.keys import issue_code
 
-pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("drafts")]
+pytestmark = pytest.mark.slow
 TEST = QUICK.replace("cycles = 5", "cycles = 8", 1)
 SEND_STOP = """fetch("command", {
   method: "POST", headers: { ...headers(), "Content-Type": "application/json" },

@@ -41,7 +41,7 @@ def logs(bundle: RunConfig, tmp_path_factory: pytest.TempPathFactory) -> list[Pa
 
 
 @pytest.fixture(scope="module")
-def table(logs: list[Path], tmp_path_factory: pytest.TempPathFactory, drafts: None) -> Path:
+def table(logs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("compared") / "out"
     models = ["recorded", str(logs[0].parent / "stiff.toml")]
     assert replay_logs(ReplayRequest(logs, models, out)) == 0

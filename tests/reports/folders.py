@@ -1,11 +1,12 @@
 """Folders of runs for the report, as the recorder and the summary leave them."""
 
 import json
-import os
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -17,27 +18,6 @@ from twin.report.report import load_report_data, render_report
 from twin.transport.codec import Item
 
 Maker = Callable[..., Path]
-COARSE = {"savefig.dpi": 30, "figure.constrained_layout.use": False, "axes.grid": False}
-BARE = dict.fromkeys(("xtick.bottom", "ytick.left", "xtick.labelbottom", "ytick.labelleft"), False)
-# Makes pictures coarse in a process that draws; one that does not draw imports nothing for it.
-DRAFT_SITE = f"""
-import importlib.util, sys
-
-class DraftFinder:
-    def find_spec(self, name, path=None, target=None):
-        if name != "twin.drawing.plot_style":
-            return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(name)
-        execute = spec.loader.exec_module
-        def execute_as_draft(module):
-            execute(module)
-            module.RC_PARAMS.update({COARSE | BARE})
-        spec.loader.exec_module = execute_as_draft
-        return spec
-
-sys.meta_path.insert(0, DraftFinder())
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,28 +52,21 @@ def drawn_report(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     """Drawn once, in full quality; to look at, not to write into."""
     folder = make(tmp_path_factory.mktemp("drawn"))
     run = load_report_data(folder)
-    pictures = figures.draw_run_figures(run, folder / "figures")
-    return Drawn(folder, pictures, render_report(run, pictures))
+    with draw_in_full_quality():
+        pictures = figures.draw_run_figures(run, folder / "figures")
+        return Drawn(folder, pictures, render_report(run, pictures))
 
 
-@pytest.fixture(scope="session")
-def draft_path(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """PYTHONPATH with which a process draws as `draft` does."""
-    folder = tmp_path_factory.mktemp("draft")
-    (folder / "sitecustomize.py").write_text(DRAFT_SITE)
-    return os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH"))))
-
-
-@pytest.fixture(scope="module")
-def drafts(draft_path: str) -> Iterator[None]:
-    """As `draft`, in all of a module and in the processes that it starts."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
-        patch.setenv("PYTHONPATH", draft_path)
+@contextmanager
+def draw_in_full_quality() -> Iterator[None]:
+    """Draw as users see it, which `tests/draft` prevents for the sake of time."""
+    full = vars(plot_style).get("FULL_RC_PARAMS", plot_style.RC_PARAMS)
+    with patch.dict(plot_style.RC_PARAMS, dict(full), clear=True):
         yield
 
 
 @pytest.fixture
-def draft(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every line of every picture, but coarse and without ticks: in a third of the time."""
-    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
+def full_quality() -> Iterator[None]:
+    """Pictures as users see them, in this process."""
+    with draw_in_full_quality():
+        yield

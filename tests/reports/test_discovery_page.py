@@ -2,7 +2,7 @@
 
 import hashlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import pytest
 from matplotlib.image import imread
 
 from table_io.config.base import PROFILES_DIR, parse_toml
-from tests.reports.folders import COARSE
+from tests.reports.folders import draw_in_full_quality
 from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import Discovery, PreparedLog, discover_effects
 from twin.discovery.figure_data import (
@@ -28,7 +28,6 @@ from twin.discovery.result import EffectResult, Interval, Verdict
 from twin.discovery.task import collect_result
 from twin.discovery.words import format_verdict
 from twin.drawing.page import format_significant
-from twin.drawing.plot_style import RC_PARAMS
 from twin.laws.typesetting import typeset_law
 from twin.model.config import ModelConfig
 from twin.model.inverse_dynamics import forces_along
@@ -108,7 +107,7 @@ def write_output(
 
 
 @pytest.fixture(scope="module")
-def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, DiscoveryOutput]]:
+def every(tmp_path_factory: pytest.TempPathFactory) -> dict[str, DiscoveryOutput]:
     """A discovery of each verdict, all of one recording; one page laid out as a user gets it.
 
     None: with the model that the one before found. Unexplained: the truth is left out of the
@@ -124,18 +123,15 @@ def every(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Discov
         known, verdict=replace(known.verdict, outcome="ambiguous", alternatives=(rival,))
     )
     stepless = [replace(log, steps=()) for log in logs]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(RC_PARAMS, "savefig.dpi", 40)
+    with draw_in_full_quality():
         out = {"named": write_output(root / "named", logs, known)}
-        for name, value in COARSE.items():
-            patch.setitem(RC_PARAMS, name, value)
-        out["ambiguous"] = write_output(root / "ambiguous", stepless, unsure)
-        whole = read_model_template(str(root / "named" / "model.toml"))[0]
-        out["none"] = write_output(root / "none", logs, discover_effects(logs, whole, without=AWAY))
-        out["unexplained"] = write_output(
-            root / "unexplained", logs, discover_effects(logs, model, without=WITHOUT)
-        )
-        yield out
+    out["ambiguous"] = write_output(root / "ambiguous", stepless, unsure)
+    whole = read_model_template(str(root / "named" / "model.toml"))[0]
+    out["none"] = write_output(root / "none", logs, discover_effects(logs, whole, without=AWAY))
+    out["unexplained"] = write_output(
+        root / "unexplained", logs, discover_effects(logs, model, without=WITHOUT)
+    )
+    return out
 
 
 @pytest.fixture(params=VERDICTS)

@@ -106,7 +106,6 @@ def test_precompression_without_a_model(run_folder: Maker, gap: str, known: set[
     assert set(compute_prestress(build_precompressed(run_folder(*one_step(), gap)))) == known
 
 
-@pytest.mark.usefixtures("draft")
 def test_precompression_is_drawn_grey(run_folder: Maker, drawn_report: Drawn) -> None:
     items, values = one_step()
     folder = run_folder([Params(0, MODEL, "start"), *items], values, "-1.0")

@@ -126,7 +126,7 @@ def test_planned_branch_is_read_from_the_recorded_profile():
     assert read_planned_branch({"sweep": {}}) is None
 
 
-def test_report_shows_branch_and_table(folder):
+def test_report_shows_branch_and_table(folder, full_quality):
     path = write_report(folder[0])
     text = path.read_text(encoding="utf-8")
     assert (folder[0] / "figures" / "orbits.png").stat().st_size > 10_000

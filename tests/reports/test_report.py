@@ -22,8 +22,6 @@ from twin.recording.reader import read_recording
 from twin.report.report import load_report_data, render_report, write_report
 from twin.transport.codec import Item
 
-pytestmark = pytest.mark.usefixtures("draft")
-
 
 def page(folder: Path) -> str:
     return write_report(folder).read_text(encoding="utf-8")

@@ -178,7 +178,6 @@ def test_estimates_beside_two_models_have_no_standard_deviations(comparable: lis
     assert (stiffness.change, stiffness.sigma, stiffness.changed) == (2e3, None, False)
 
 
-@pytest.mark.usefixtures("draft")
 def test_the_comparison_has_a_page_and_its_data(comparable: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "compared"
     assert call_main("compare", *comparable, "--out", out).returncode == 0

@@ -97,7 +97,7 @@ def test_without_a_card_the_tare_is_still_shown(text: str) -> None:
 
 
 def test_a_run_warns_records_and_reports_what_is_overdue(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draft: None
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "card.toml").write_text(CARD)

@@ -202,7 +202,7 @@ def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -
     assert summarise_tracking(late, read_profile(recording)) is None
 
 
-def test_the_report_has_a_section_with_its_figures(run: Run) -> None:
+def test_the_report_has_a_section_with_its_figures(run: Run, full_quality: None) -> None:
     _, recording, summary = run
     table = write_spectrum(recording, 1.2) | {"required_upper": np.inf, "damping": 0.025}
     profile = read_profile(recording, **table)

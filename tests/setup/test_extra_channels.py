@@ -47,8 +47,6 @@ rate_hz = 1000.0
 sensor = "warn"
 """
 
-pytestmark = pytest.mark.usefixtures("drafts")
-
 
 def shaketwin(*arguments: str | Path, code: int = 0) -> str:
     """The output of the command, which ends with this code."""

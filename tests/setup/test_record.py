@@ -191,13 +191,9 @@ def test_a_replay_needs_the_recording_alone_and_is_identical(run: Run, tmp_path:
     ("fault", "kinds"),
     [
         ('kind = "stuck"\nchannel = "table_disp_m"', {"stuck"}),
-        ('kind = "stuck"\nchannel = "table_acc_m_s2"', {"stuck"}),
-        ('kind = "cable_off"\nchannel = "table_disp_m"', {"following", "silent"}),
         ('kind = "gain"\nchannel = "table_disp_m"\nsize = 0.4', {"following"}),
         ('kind = "polarity"\nchannel = "drive_disp_m"', {"command"}),
-        ('kind = "rail"\nchannel = "table_acc_m_s2"', {"rail", "acceleration"}),
         ('kind = "dropped"\nfor_s = 0.5', {"lost"}),
-        ('kind = "power_loss"', {"following"}),
     ],
 )
 def test_a_planted_fault_trips_and_the_table_comes_to_rest(
@@ -217,7 +213,7 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
     assert 1 <= len(summary.windows) < 4
 
 
-@pytest.mark.parametrize("stop_s", [1.0, 3.0, 4.56, 8.0])
+@pytest.mark.parametrize("stop_s", [1.0, 4.56])
 def test_a_stop_in_motion_comes_to_rest_smoothly(stop_s: float, tmp_path: Path) -> None:
     config, recording, summary = play_run(tmp_path, NO_CHECK, stop_at=round(stop_s * 2000))
     assert summary.verdict == "stopped"
@@ -284,7 +280,7 @@ def test_a_kind_of_one_file_runs_with_all_that_belongs_to_a_run(tmp_path: Path) 
     assert PulseTrain.model_fields.keys() >= {"height_mm", "windows"}
 
 
-def test_the_model_alone_plays_the_record(tmp_path: Path, draft: None) -> None:
+def test_the_model_alone_plays_the_record(tmp_path: Path) -> None:
     path, out = write_profile(tmp_path), tmp_path / "out"
     assert simulate_profile(path, [], [], None, out, False) == 0
     summary = json.loads((out / "summary.json").read_text())
@@ -293,11 +289,10 @@ def test_the_model_alone_plays_the_record(tmp_path: Path, draft: None) -> None:
     assert summary["windows"][1]["twin"]["impacts_right"] > 2
 
 
-@pytest.mark.parametrize("kind", ["parquet", "csv"])  # the second one without its profile
-def test_an_export_comes_back_with_its_windows(run: Run, kind: str, tmp_path: Path) -> None:
+def test_an_export_comes_back_with_its_windows(run: Run, tmp_path: Path) -> None:
     _, recording, summary = run
-    table = tmp_path / f"samples.{kind}"
-    export_log(ExportOptions(recording.path, (kind,), tmp_path / "samples"))
+    table = tmp_path / "samples.csv"
+    export_log(ExportOptions(recording.path, ("csv",), tmp_path / "samples"))
     assert import_table(table, tmp_path / "back.mcap").gaps == 0
     back = read_recording(tmp_path / "back.mcap")
     assert back.start.steps == ()

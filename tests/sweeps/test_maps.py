@@ -438,8 +438,9 @@ PAGES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", PAGES)
-@pytest.mark.parametrize("is_partial", [False, True])
+@pytest.mark.parametrize(
+    ("kind", "is_partial"), [*((kind, False) for kind in PAGES), ("panels", True)]
+)
 def test_every_kind_of_study_has_a_page(tmp_path: Path, kind: str, is_partial: bool) -> None:
     """Also one of which half of the chunks are stored."""
     text, count = PAGES[kind]

@@ -122,7 +122,7 @@ def test_a_gap_that_is_none_is_refused(words: list[str], fields: dict[str, str])
         parse_gaps_mm(words)
 
 
-def test_the_table_holds_the_motion_of_every_case(profile: Path, draft: None) -> None:
+def test_the_table_holds_the_motion_of_every_case(profile: Path) -> None:
     hard = model(profile.parent, "hard", HARDENING)
     out = simulate_batch(profile, ["snm", hard], ["4", "-1", "inf"])
     rows = read_rows(out / "batch.csv")
@@ -154,7 +154,7 @@ def test_the_table_holds_the_motion_of_every_case(profile: Path, draft: None) ->
                                            rtol=2e-5, atol=1e-12)  # fmt: skip
 
 
-def test_the_summary_tells_jumps_and_hysteresis_of_each_case(profile: Path, draft: None) -> None:
+def test_the_summary_tells_jumps_and_hysteresis_of_each_case(profile: Path) -> None:
     values = summary(simulate_batch(profile, [], ["4", "inf"]))
     assert values["verdict"] == "complete"
     g4, free = values["cases"]
@@ -168,7 +168,7 @@ def test_the_summary_tells_jumps_and_hysteresis_of_each_case(profile: Path, draf
     assert g4["u_star_m"] == pytest.approx(30.537e-3, abs=1e-6)
 
 
-def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft: None) -> None:
+def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path) -> None:
     profile.write_text(
         TEST.replace("gap_mm = 4.0", "gap_mm = 4.0\ngap_right_mm = 1.0\ngap_left_mm = 2.5")
     )
@@ -183,7 +183,7 @@ def test_models_without_a_gap_keep_the_gaps_of_the_profile(profile: Path, draft:
     np.testing.assert_allclose([r["r_l"] for r in mine], force[force > 0] / 550 / 9.80665)
 
 
-def test_a_drifting_gap_is_the_one_of_its_time(profile: Path, draft: None) -> None:
+def test_a_drifting_gap_is_the_one_of_its_time(profile: Path) -> None:
     drift = model(profile.parent, "drift", EFFECT.format("gap_drift", "rate = 1e-5"))
     rows = read_rows(simulate_batch(profile, [drift], ["4"]) / "batch.csv")
     deep = {row["frequency_hz"]: row for row in rows if row["direction"] == "forward"}[3.4]
@@ -193,7 +193,7 @@ def test_a_drifting_gap_is_the_one_of_its_time(profile: Path, draft: None) -> No
 
 
 def test_a_plug_in_effect_is_played_like_any_other(
-    profile: Path, draft: None, monkeypatch: pytest.MonkeyPatch
+    profile: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     number = EffectParameter("k3", "N/m3", 0.0, 1e10, 0.0, 1e6, "")
     cubic = Effect("my_cubic", (number,), term="k3 u^3", force="k3 * u * u * u")
@@ -214,7 +214,7 @@ def test_a_plug_in_effect_is_played_like_any_other(
     np.testing.assert_allclose(eta["mine"], eta["ours"], rtol=1e-9)
 
 
-def test_a_motion_without_bound_is_said_and_drawn(profile: Path, draft: None) -> None:
+def test_a_motion_without_bound_is_said_and_drawn(profile: Path) -> None:
     soft = model(
         profile.parent, "soft", EFFECT.format("cubic_stiffness", "k3 = -3e7"), damping_n_s_m=50.0
     )
@@ -225,7 +225,7 @@ def test_a_motion_without_bound_is_said_and_drawn(profile: Path, draft: None) ->
     assert "unbounded from" in (out / "report.html").read_text()
 
 
-def test_workers_change_nothing(profile: Path, draft: None) -> None:
+def test_workers_change_nothing(profile: Path) -> None:
     tables = []
     for cores in (1, 2):
         folder = profile.parent / f"{cores}"
@@ -236,7 +236,7 @@ def test_workers_change_nothing(profile: Path, draft: None) -> None:
     assert tables[0] == tables[1]
 
 
-def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path, draft: None) -> None:
+def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path) -> None:
     out = profile.parent / "out"
     assert simulate_profile(profile, ["snm"], [], 1, out, False) == 0
     assert (out / "run.mcap").exists()
@@ -275,10 +275,7 @@ def test_a_batch_that_cannot_be_is_refused_before_it_begins(profile: Path) -> No
     require_refused(profile, [undamped], ["inf"], {"where": case, "key": "damping", "value": 0})
 
 
-def test_ctrl_c_keeps_the_sweeps_that_are_done(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, draft_path: str
-) -> None:
-    monkeypatch.setenv("PYTHONPATH", draft_path)
+def test_ctrl_c_keeps_the_sweeps_that_are_done(tmp_path: Path) -> None:
     profile = tmp_path / "long.toml"
     profile.write_text(TEST.replace("cycles = 5", "cycles = 60", 1))
     hard = model(tmp_path, "hard", HARDENING)
@@ -331,7 +328,7 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 
 
-def test_many_gaps_are_read_off_a_scale(profile: Path, draft: None) -> None:
+def test_many_gaps_are_read_off_a_scale(profile: Path) -> None:
     cases = figures.group_cases(
         read_batch_rows(simulate_batch(profile, [], ["0:20:2"]) / "batch.csv")
     )
@@ -341,7 +338,7 @@ def test_many_gaps_are_read_off_a_scale(profile: Path, draft: None) -> None:
     assert len(colours) == 11
 
 
-def test_the_page_is_written_anew_from_what_is_in_the_folder(profile: Path, draft: None) -> None:
+def test_the_page_is_written_anew_from_what_is_in_the_folder(profile: Path) -> None:
     out = simulate_batch(profile, [], ["4", "6", "8"])
     html = (out / "report.html").read_text()
     assert html.count("data:image/png;base64,") == len(list((out / "figures").iterdir())) == 2
@@ -357,7 +354,7 @@ def test_the_page_is_written_anew_from_what_is_in_the_folder(profile: Path, draf
         write_folder_report(out)
 
 
-def test_files_of_models_with_odd_names_do_not_meet(tmp_path: Path, draft: None) -> None:
+def test_files_of_models_with_odd_names_do_not_meet(tmp_path: Path) -> None:
     first, other = tmp_path / "a", tmp_path / "b"
     for folder in (first, other):
         folder.mkdir()

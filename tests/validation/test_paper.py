@@ -13,9 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from tests.input_errors import raises_input_error
-from tests.reports.folders import BARE, COARSE
 from twin.cli.table import app
-from twin.drawing import plot_style
 from twin.paper import command
 from twin.paper.findings import count_onsets_per_cycle, find_bands
 from twin.paper.study import CHAOS_SCAN_HZ, PaperStudy, run_paper_study
@@ -219,13 +217,12 @@ def test_impacts_are_cut_where_they_are_rare():
 
 
 @pytest.fixture
-def draft(monkeypatch: pytest.MonkeyPatch, study: PaperStudy) -> None:
-    """Every picture, but coarse; the study of this module."""
-    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
+def known_study(monkeypatch: pytest.MonkeyPatch, study: PaperStudy) -> None:
+    """The command shows the study of this module."""
     monkeypatch.setattr(command, "run_paper_study", lambda *_: study)
 
 
-def test_the_command_leaves_figures_page_and_json(draft, tmp_path: Path):
+def test_the_command_leaves_figures_page_and_json(known_study, tmp_path: Path):
     out = tmp_path / "paper"
     result = CliRunner().invoke(app, ["paper", "--out", str(out)])
     assert result.exit_code == 0, result.output
@@ -261,7 +258,7 @@ def test_a_campaign_without_recordings_is_refused(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_campaign_adds_the_measured_points(draft, tmp_path: Path):
+def test_a_campaign_adds_the_measured_points(known_study, tmp_path: Path):
     """The simulated rig in the place of the experiment, quickstart."""
     run = CliRunner().invoke(
         app,

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from tests.input_errors import raises_input_error
-from tests.reports.folders import BARE, COARSE
-from twin.drawing import plot_style
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.paper import command, findings, study
@@ -147,10 +145,7 @@ def test_hysteresis_of_an_integrated_model_is_that_of_slow_passage(tmp_path: Pat
 
 
 @pytest.mark.slow
-def test_every_figure_of_an_integrated_model(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(plot_style, "RC_PARAMS", {**plot_style.RC_PARAMS, **COARSE, **BARE})
+def test_every_figure_of_an_integrated_model(tmp_path: Path) -> None:
     out = tmp_path / "out"
     command.compare_with_paper(out, [], card(tmp_path, "bumper_hardening", "k2 = 6e7"))
     results = json.loads((out / "paper.json").read_text())

@@ -113,7 +113,6 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow  # 10 s
-@pytest.mark.usefixtures("drafts")
 def test_example_is_checked_runs_and_is_replayed_without_its_package(lab: Path) -> None:
     site = lab / "site"
     table = ("two.toml", "--table", "rig.toml")

@@ -122,11 +122,24 @@ SLOW_BENCHES = {"udp python, lossy", "udp c", "udp python"}
 
 
 @pytest.fixture(scope="module")
-def bench(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Bench]:
-    with BENCHES[request.param](tmp_path_factory.mktemp("bench")) as opened:
-        yield opened
+def open_bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str], Bench]]:
+    """Opens a bench by its name and keeps it until another one is asked for."""
+    with ExitStack() as stack:
+        opened: dict[str, Bench] = {}
+
+        def find(name: str) -> Bench:
+            if name not in opened:
+                opened.clear()
+                stack.close()
+                opened[name] = stack.enter_context(BENCHES[name](tmp_path_factory.mktemp("bench")))
+            return opened[name]
+
+        yield find
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, open_bench: Callable[[str], Bench]) -> Bench:
+    return open_bench(request.param)
 
 
 @pytest.mark.parametrize(
