@@ -17,6 +17,7 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.branches.task import BranchOptions, FollowedBranches, follow_branches
+from twin.campaign.simulate_grid import GapOptions, SimulatedGaps, simulate_gaps
 from twin.discovery.decide import DecidedTests, decide
 from twin.discovery.decisive_test import DecideOptions
 from twin.discovery.features.task import FeatureModel, discover_features
@@ -39,6 +40,8 @@ from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced, simulate_ideal
 from twin.setup.warm_up import compile_kernels
 from twin.studies.maps.results import open_study
+from twin.studies.maps.task import MapOptions, StoredMap, compute_map
+from twin.studies.task import SimulatedSweeps, SweepOptions, simulate_sweeps
 
 __all__ = [
     "BranchOptions",
@@ -57,12 +60,18 @@ __all__ = [
     "FeatureVerdict",
     "FittedModel",
     "FollowedBranches",
+    "GapOptions",
     "IdentificationReport",
     "ImportOptions",
     "Imported",
     "InputError",
     "Interval",
     "Log",
+    "MapOptions",
+    "SimulatedGaps",
+    "SimulatedSweeps",
+    "StoredMap",
+    "SweepOptions",
     "TableDriveOptions",
     "TableTwinOptions",
     "TableTwinResult",
@@ -73,6 +82,7 @@ __all__ = [
     "check_table",
     "check_test",
     "compute_drive",
+    "compute_map",
     "decide",
     "discover",
     "discover_features",
@@ -89,6 +99,8 @@ __all__ = [
     "replay",
     "run_simulated",
     "simulate",
+    "simulate_gaps",
+    "simulate_sweeps",
     "verify",
 ]
 

@@ -27,8 +27,8 @@ from tests.sweeps.small_study import (
 )
 from tests.system.clusters import start_cluster, start_quietly
 from twin.api import open_study
-from twin.studies import DEFINITION_FILE
-from twin.studies.maps import command
+from twin.studies import DEFINITION_FILE, command
+from twin.studies.maps import task
 from twin.studies.maps.compute import (
     compute_chunk,
     compute_outcomes,
@@ -38,6 +38,8 @@ from twin.studies.maps.store import (
     remove_partial_files,
 )
 from twin.studies.maps.study import Study
+from twin.studies.maps.task import MapOptions
+from twin.system import grid
 from twin.system.process_pool import TaskResult
 
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
@@ -126,7 +128,7 @@ def test_a_finished_study_computes_nothing_again(
     whole_study: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = read_stored_bytes(whole_study / "out")
-    monkeypatch.setattr(command, "run_tasks", run_no_task)
+    monkeypatch.setattr(grid, "run_tasks", run_no_task)
     out = whole_study / "out"
     assert call_main("map", whole_study / "study.toml", "--out", out, "--resume").returncode == 0
     assert read_stored_bytes(out) == before
@@ -179,7 +181,7 @@ def test_a_damaged_file_is_named(whole_study: Path, tmp_path: Path, name: str, t
     make_stored_study(whole_study / "study.toml", out, range(1))
     (out / name).write_text(text)
     with raises_input_error(where=out / name):
-        command.run_study(whole_study / "study.toml", out, 1, "", True, False)
+        command.run_study(MapOptions(whole_study / "study.toml", out, 1, resume=True), False)
 
 
 @pytest.mark.slow
@@ -243,11 +245,11 @@ def list_children(pid: int) -> list[int]:
 def test_another_study_is_not_mixed_into_the_first(whole_study: Path, tmp_path: Path) -> None:
     changed = write_study(tmp_path, STUDY.replace("count = 6", "count = 7"))
     with raises_input_error(key="--resume", problem="study"):
-        command.run_study(changed, whole_study / "out", 1, "", True, False)
+        command.run_study(MapOptions(changed, whole_study / "out", 1, resume=True), False)
     with raises_input_error(key="--out"):
-        command.run_study(changed, whole_study / "out", 1, "", False, False)
+        command.run_study(MapOptions(changed, whole_study / "out", 1), False)
     with raises_input_error(where=tmp_path / "none"):
-        command.run_study(changed, tmp_path / "none", 1, "", True, False)
+        command.run_study(MapOptions(changed, tmp_path / "none", 1, resume=True), False)
 
 
 def test_other_versions_are_refused(
@@ -259,16 +261,16 @@ def test_other_versions_are_refused(
     definition["versions"]["numpy"] = "0.1"
     (out / DEFINITION_FILE).write_text(json.dumps(definition))
     with raises_input_error(key="--resume", problem="numpy 0.1"):
-        command.run_study(whole_study / "study.toml", out, 1, "", True, False)
+        command.run_study(MapOptions(whole_study / "study.toml", out, 1, resume=True), False)
     assert "numpy 0.1" in compute_chunk(out, 1)["error"]
 
 
 def test_what_does_not_fit_on_the_disk_is_not_started(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(command, "free_bytes", lambda _: 1000)
+    monkeypatch.setattr(task, "free_bytes", lambda _: 1000)
     with raises_input_error(where=tmp_path):
-        command.run_study(whole_study / "study.toml", tmp_path, 1, "", False, False)
+        command.run_study(MapOptions(whole_study / "study.toml", tmp_path, 1), False)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -282,7 +284,7 @@ def test_what_does_not_fit_into_memory_is_not_started(tmp_path: Path) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(os, "sysconf", lambda name: 1 if "PAGES" in name else min(limit, 10**9))
         with raises_input_error(key="parameters"):
-            command.run_study(path, tmp_path / "out", 1, "", False, False)
+            command.run_study(MapOptions(path, tmp_path / "out", 1), False)
     assert not (tmp_path / "out").exists()
 
 
@@ -312,9 +314,9 @@ def test_a_chunk_that_always_dies_ends_the_study_with_its_number(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     failure = TaskResult(3, failure="its process died (exit code -9)")
-    monkeypatch.setattr(command, "run_tasks", lambda *_, **__: [failure])
+    monkeypatch.setattr(grid, "run_tasks", lambda *_, **__: [failure])
     with raises_input_error(problem="chunk 3"):
-        command.run_study(whole_study / "study.toml", tmp_path / "out", 1, "", False, False)
+        command.run_study(MapOptions(whole_study / "study.toml", tmp_path / "out", 1), False)
 
 
 def test_what_zarr_leaves_behind_is_removed_and_nothing_else(
@@ -378,15 +380,15 @@ def test_a_package_adds_an_outcome(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path: Path) -> None:
     path = whole_study / "study.toml"
     with raises_input_error(key="--workers"):
-        command.run_study(path, tmp_path / "out", 0, "", False, False)
+        command.run_study(MapOptions(path, tmp_path / "out", 0), False)
     with raises_input_error(key="--workers"):
-        command.run_study(path, tmp_path / "out", 2, "tcp://host:1", False, False)
+        command.run_study(MapOptions(path, tmp_path / "out", 2, "tcp://host:1"), False)
     with raises_input_error(key="--out"):
-        command.run_study(path, None, 2, "", True, False)
+        command.run_study(MapOptions(path, None, 2, resume=True), False)
     with raises_input_error(where=whole_study / "out"):
-        command.run_study(whole_study / "out", None, 2, "", False, False)
+        command.run_study(MapOptions(whole_study / "out", None, 2), False)
     with raises_input_error(where=tmp_path):
-        command.run_study(tmp_path, None, None, "", False, True)
+        command.run_study(MapOptions(tmp_path, None, None), True)
 
 
 def test_a_scheduler_that_does_not_answer_leaves_no_folder(
@@ -395,6 +397,7 @@ def test_a_scheduler_that_does_not_answer_leaves_no_folder(
     monkeypatch.setattr("twin.system.process_pool.CONNECT_TIMEOUT_S", 0.5)
     with raises_input_error(key="--scheduler"):
         command.run_study(
-            whole_study / "study.toml", tmp_path / "out", None, "tcp://127.0.0.1:9", False, False
+            MapOptions(whole_study / "study.toml", tmp_path / "out", None, "tcp://127.0.0.1:9"),
+            False,
         )
     assert not (tmp_path / "out").exists()

@@ -27,7 +27,7 @@ from twin.setup.run_config import read_model
 from twin.simulation.command import simulate_profile
 from twin.studies import figures
 from twin.studies.cases import parse_gaps_mm
-from twin.studies.rows import COLUMNS, read_batch_rows
+from twin.studies.result import COLUMNS, read_batch_rows
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 TEST = """

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
 
@@ -10,11 +11,13 @@ import numpy as np
 from table_io.block import Block, Float1D, Label
 from table_io.channels import contact_forces, relative_displacement
 from table_io.config.excitation.record import RecordedHistory
+from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import Event
 from twin.campaign.config import PlannedRun, read_plan
 from twin.campaign.figures import draw_gap_pairs
 from twin.campaign.gap_comparison import (
+    GapComparison,
     compare_gaps,
     describe_comparison,
     format_gap,
@@ -25,22 +28,60 @@ from twin.campaign.report import SYMBOLS, embed_pairs, list_gap_tables
 from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.drawing.page import render_page
 from twin.model.valid_range import EVENT_KIND
+from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.contracts import MotionResult, PeakAndRms, RunInfo, RunSummary, WindowResult
 from twin.results.windows import extract_free_twin
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import generate_ideal_twin
 from twin.setup.warm_up import compile_kernels
+from twin.system.grid import Watch, run_grid, watch_on_terminal
+from twin.system.process_pool import Workers
 from twin.system.terminal import print_line, show_status
 
 
-def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
-    """Simulate the records of a campaign at their gaps; write and print the comparison of the gaps.
+@dataclass(frozen=True, slots=True)
+class GapOptions:
+    """A campaign that plays records at several gaps, and the model, by default its own."""
 
-    InputError if the campaign does not play a record at several gaps.
+    campaign: Path
+    model: str | None = None
+    out: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedGaps:
+    """The comparison of gaps by the model alone, the page of it, and what the laws warn of."""
+
+    comparison: GapComparison
+    page: Path
+    reason: str
+    warnings: tuple[str, ...]
+
+
+def simulate_grid(options: GapOptions) -> int:
+    """Simulate the records of a campaign at their gaps; print the comparison of the gaps."""
+    with watch_on_terminal("stopping after the record in progress") as watch:
+        result = simulate_gaps(options, watch)
+    if result is None:
+        print_line("stopped: nothing is written before every record is simulated")
+        return EXIT_INTERRUPTED
+    print_gap_comparison(describe_comparison(result.comparison))
+    for text in result.warnings:
+        print_line(f"warning: {text}")
+    print_line(f"{result.reason}, model alone -> {result.page}")
+    return 0
+
+
+def simulate_gaps(options: GapOptions, watch: Watch | None = None) -> SimulatedGaps | None:
+    """Simulate the records of a campaign at their gaps on an ideal table, and compare the gaps.
+
+    Writes summary.json, figures and report.html; None if the watch stops it. InputError if the
+    campaign does not play a record at several gaps.
     """
+    watch = watch or Watch()
     with show_status("checking the runs"):
-        plan = read_plan(path, None, model, lambda *_: None)
+        plan = read_plan(options.campaign, None, options.model, lambda *_: None)
     names = plan.config.record_names
     planned = [
         run for run in plan.runs if isinstance(run.bundle.profile.excitation, RecordedHistory)
@@ -49,22 +90,32 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
     if compare_gaps(list_record_runs(blank, names), ("twin",)) is None:
         raise InputError(
             "the model alone is simulated for records at several gaps",
-            where=path,
+            where=options.campaign,
             allowed="a campaign with [records]",
             remedy="simulate a single test, or play the campaign with `shaketwin campaign`",
         )
     compile_kernels(planned[0].bundle)
-    folder, _ = make_run_folder(out, f"{plan.path.stem}-model")
-    runs, warnings = [], []
-    with show_status("simulating") as show_part:
-        for run in planned:
-            show_part(run.label)
-            peaks, range_exits = simulate_peaks(run.bundle)
-            runs.append((run.label, run.bundle.profile, peaks))
-            warnings += [f"{run.label}: {text}" for text in range_exits]
+    folder, _ = make_run_folder(options.out, f"{plan.path.stem}-model")
+    runs: list[tuple[str, Profile, RunSummary]] = []
+    warnings: list[str] = []
+
+    def keep(number: int, simulated: tuple[RunSummary, list[str]]) -> int:
+        peaks, range_exits = simulated
+        label = planned[number].label
+        runs.append((label, planned[number].bundle.profile, peaks))
+        warnings.extend(f"{label}: {text}" for text in range_exits)
+        return 1
+
+    run_grid(
+        lambda number: simulate_peaks(planned[number].bundle),
+        range(len(planned)), Workers(1, in_threads=True), keep, watch,
+        unit="records", total=len(planned), is_ordered=True,
+        describe_failure=lambda number, reason: InputError(reason, where=planned[number].label),
+    )  # fmt: skip
+    if len(runs) < len(planned):
+        return None
     comparison = compare_gaps(list_record_runs(runs, names), ("twin",))
     assert comparison is not None
-    pairs = draw_gap_pairs(comparison, folder / "figures")
     described = describe_comparison(comparison)
     summary = CampaignSummary(
         campaign=CampaignInfo(
@@ -83,7 +134,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         Path(__file__).with_name("gap_page.html"),
         summary=summary,
         gaps=described,
-        pictures=embed_pairs(pairs),
+        pictures=embed_pairs(draw_gap_pairs(comparison, folder / "figures")),
         text=plan.text,
         digest=sha256(plan.text.encode()).hexdigest(),
         tables=list_gap_tables(comparison),
@@ -91,11 +142,7 @@ def simulate_grid(path: Path, model: str | None, out: Path | None) -> int:
         gap_name=format_gap,
     )
     (folder / "report.html").write_text(page, encoding="utf-8")
-    print_gap_comparison(described)
-    for text in warnings:
-        print_line(f"warning: {text}")
-    print_line(f"{summary.reason}, model alone -> {folder / 'report.html'}")
-    return 0
+    return SimulatedGaps(comparison, folder / "report.html", summary.reason, tuple(warnings))
 
 
 def simulate_peaks(config: RunConfig) -> tuple[RunSummary, list[str]]:

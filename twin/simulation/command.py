@@ -31,9 +31,9 @@ def simulate_profile(
                 where=profile,
                 remedy="omit --gap, --view, --workers and --scheduler, and give one --model",
             )
-        from twin.campaign.simulate_grid import simulate_grid
+        from twin.campaign.simulate_grid import GapOptions, simulate_grid
 
-        return simulate_grid(campaign, models[0] if models else None, out)
+        return simulate_grid(GapOptions(campaign, models[0] if models else None, out))
     if len(models) <= 1 and not gaps:
         if scheduler:
             raise InputError(
@@ -48,8 +48,9 @@ def simulate_profile(
             "shows one run only", where="--view", remedy="omit it, or give one --model and no --gap"
         )
     from twin.studies.command import simulate_all
+    from twin.studies.task import SweepOptions
 
-    return simulate_all(profile, models, gaps, workers, scheduler, out)
+    return simulate_all(SweepOptions(profile, models, gaps, workers, scheduler, out))
 
 
 def _simulate_one(profile: Path, model: str | None, out: Path | None, view: bool) -> int:

@@ -1,8 +1,8 @@
 """One sweep of a batch: the task of `simulate`, in a thread or on a worker of a cluster."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
 
@@ -16,9 +16,9 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import RangeExit, select_first_exits
 from twin.results import ideal_points
-from twin.results.contract import Json
+from twin.results.summary import make_intervals, make_jumps
 from twin.studies.cases import StudyCase, build_cases
-from twin.studies.rows import Row, make_rows
+from twin.studies.result import IMPACT_COLUMNS, RATIO_COLUMNS, CaseSummary, Peak, Point, Row
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class CaseResult:
     """Rows of the table, the entry of summary.json, and where laws leave their fitted ranges."""
 
     rows: list[Row]
-    entry: Json
+    entry: CaseSummary
     range_exits: list[RangeExit]
 
 
@@ -67,39 +67,56 @@ def simulate_case(batch: Batch, number: int) -> CaseResult:
     )
     exits = list(select_first_exits(chain.from_iterable(response.range_exits)))
     return CaseResult(
-        list(make_rows(case, points)), _make_entry(case, points, acceleration, exits), exits
+        list(_make_rows(case, points)), _summarise_case(case, points, acceleration, exits), exits
     )
 
 
-def _make_entry(
+def _make_rows(case: StudyCase, points: Sequence[PrcPoint]) -> Iterator[Row]:
+    """Yield a row per PRC point; impacts are means per cycle."""
+    for point in points:
+        if point.twin is not None:
+            yield {
+                "model": case.label,
+                "gap_mm": case.gap_mm,
+                "direction": point.direction,
+                "frequency_hz": point.frequency_hz,
+                **{name: getattr(point.twin, name) for name in RATIO_COLUMNS},
+                **{name: _mean_impacts(getattr(point.twin, name)) for name in IMPACT_COLUMNS},
+            }
+
+
+def _mean_impacts(counts: tuple[int, ...]) -> float:
+    return sum(counts) / len(counts) if counts else math.nan
+
+
+def _summarise_case(
     case: StudyCase,
     points: tuple[PrcPoint, ...],
     acceleration_m_s2: float,
     range_exits: Sequence[RangeExit],
-) -> Json:
-    """Build a case of summary.json; the gap without bumpers is "inf", as JSON has no infinity."""
+) -> CaseSummary:
+    """Return the entry of a case in summary.json."""
     u_star, a_star, peak_hz = free_flight_resonance(case.model.parameters, acceleration_m_s2)
     jumps, intervals = detect_hysteresis(points, "twin")
-    bounded = [point for point in points if point.twin and math.isfinite(point.twin.eta_d)]
-    peak_point = max(
-        bounded, key=lambda point: point.twin.eta_d if point.twin else 0.0, default=None
+    bounded = [
+        Peak(frequency_hz=point.frequency_hz, direction=point.direction, eta_d=point.twin.eta_d)
+        for point in points
+        if point.twin and math.isfinite(point.twin.eta_d)
+    ]
+    unbounded = [
+        Point(frequency_hz=point.frequency_hz, direction=point.direction)
+        for point in points
+        if not point.twin or not math.isfinite(point.twin.eta_d)
+    ]
+    return CaseSummary(
+        model=case.label,
+        gap_mm=case.gap_mm,
+        u_star_m=u_star,
+        a_star_m_s2=a_star,
+        free_flight_hz=peak_hz,
+        peak=max(bounded, key=lambda peak: peak.eta_d, default=None),
+        jumps=make_jumps(jumps),
+        hysteresis=make_intervals(intervals),
+        unbounded_from=next(iter(unbounded), None),
+        warnings=[*map(str, range_exits)],
     )
-    unbounded_point = next((point for point in points if point not in bounded), None)
-    return {
-        "model": case.label,
-        "gap_mm": case.gap_mm if math.isfinite(case.gap_mm) else "inf",
-        "u_star_m": u_star,
-        "a_star_m_s2": a_star,
-        "free_flight_hz": peak_hz,
-        "peak": _location_entry(peak_point) | {"eta_d": peak_point.twin.eta_d}
-        if peak_point and peak_point.twin
-        else None,
-        "jumps": [asdict(jump) for jump in jumps],
-        "hysteresis": [asdict(interval) for interval in intervals],
-        "unbounded_from": _location_entry(unbounded_point) if unbounded_point else None,
-        "warnings": [str(range_exit) for range_exit in range_exits],
-    }
-
-
-def _location_entry(point: PrcPoint) -> Json:
-    return {"frequency_hz": point.frequency_hz, "direction": point.direction}

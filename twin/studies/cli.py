@@ -35,6 +35,7 @@ def map_command(
     ] = False,
 ) -> None:
     """Map outcomes of the model over any of its parameters, on all cores or a cluster."""
-    from twin.studies.maps.command import run_study
+    from twin.studies.command import run_study
+    from twin.studies.maps.task import MapOptions
 
-    raise typer.Exit(run_study(study, out, workers, scheduler, resume, show))
+    raise typer.Exit(run_study(MapOptions(study, out, workers, scheduler, resume), show))

@@ -38,7 +38,7 @@ from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_pa
 from twin.results.contract import Json
 from twin.results.report_data import Curve
 from twin.studies.cases import format_gap_mm
-from twin.studies.rows import Row
+from twin.studies.result import CaseSummary, Row, SweepSummary
 
 Curves = dict[str, list[Row]]  # direction -> rows in ascending frequency
 CaseCurves = dict[tuple[str, float], Curves]  # (model, gap in mm) -> curves
@@ -71,9 +71,9 @@ GAP_CAPTION = (
 )
 
 
-def draw_study_figures(rows: Sequence[Row], summary: Json, folder: Path) -> list[Picture]:
+def draw_study_figures(rows: Sequence[Row], summary: SweepSummary, folder: Path) -> list[Picture]:
     """Draw the figures of a batch as PNG files in `folder`; return them in page order."""
-    return save_figures(_draw_figures(group_cases(rows), summary["cases"]), folder)
+    return save_figures(_draw_figures(group_cases(rows), summary.cases), folder)
 
 
 def group_cases(rows: Sequence[Row]) -> CaseCurves:
@@ -87,7 +87,7 @@ def group_cases(rows: Sequence[Row]) -> CaseCurves:
     return cases
 
 
-def _draw_figures(cases: CaseCurves, entries: list[Json]) -> CaptionedFigures:
+def _draw_figures(cases: CaseCurves, entries: list[CaseSummary]) -> CaptionedFigures:
     """Yield the figures with unique names that are valid as file names."""
     names: set[str] = set()
     for figure in _draw_each(cases, entries):
@@ -97,14 +97,14 @@ def _draw_figures(cases: CaseCurves, entries: list[Json]) -> CaptionedFigures:
         yield replace(figure, name=name)
 
 
-def _draw_each(cases: CaseCurves, entries: list[Json]) -> CaptionedFigures:
+def _draw_each(cases: CaseCurves, entries: list[CaseSummary]) -> CaptionedFigures:
     labels = list(dict.fromkeys(label for label, _ in cases))
     gaps = list(dict.fromkeys(gap for _, gap in cases))
     for label in labels[:MAX_FIGURES]:
         curves_by_gap = {gap: curves for (model, gap), curves in cases.items() if model == label}
         if len(curves_by_gap) > 1 or len(labels) == 1:
             yield draw_family(label, curves_by_gap)
-        yield from draw_gap_figure(label, [entry for entry in entries if entry["model"] == label])
+        yield from draw_gap_figure(label, [entry for entry in entries if entry.model == label])
     if len(labels) > 1:
         for gap in _thin_out(gaps):
             curves_by_model = {
@@ -200,22 +200,22 @@ def draw_models(gap: float, curves_by_model: dict[str, Curves]) -> CaptionedFigu
     )
 
 
-def draw_gap_figure(label: str, entries: list[Json]) -> CaptionedFigures:
+def draw_gap_figure(label: str, entries: list[CaseSummary]) -> CaptionedFigures:
     """Draw one figure from the summary entries of the cases of one model."""
-    cases = sorted((entry for entry in entries if entry["gap_mm"] != "inf" and entry["peak"]),
-                   key=lambda entry: float(entry["gap_mm"]))  # fmt: skip
+    peaks = {case.gap_mm: case.peak for case in entries if case.peak and math.isfinite(case.gap_mm)}
+    cases = sorted((case for case in entries if case.gap_mm in peaks), key=lambda case: case.gap_mm)
     if len(cases) < MIN_FINITE_GAPS:
         return
     figure = Figure(figsize=(11, 6.4))
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(1, 2))
-    gaps = [case["gap_mm"] for case in cases]
-    top.plot(gaps, [case["peak"]["eta_d"] for case in cases], "o-", color=TWIN_COLOUR)
+    gaps = sorted(peaks)
+    top.plot(gaps, [peaks[gap].eta_d for gap in gaps], "o-", color=TWIN_COLOUR)
     top.set_ylabel(r"largest $\eta_d$")
     top.set_ylim(bottom=0)
     width = 0.7 * min(b - a for a, b in pairwise(gaps))
     for case in cases:
         _plot_branches(bottom, case, width)
-    bottom.plot(gaps, [case["peak"]["frequency_hz"] for case in cases], "o-", ms=3, lw=0.8,
+    bottom.plot(gaps, [peaks[gap].frequency_hz for gap in gaps], "o-", ms=3, lw=0.8,
                 color=TWIN_COLOUR, zorder=3)  # fmt: skip
     bottom.set_ylabel("frequency in Hz")
     bottom.set_xlabel("total gap in mm")
@@ -223,44 +223,44 @@ def draw_gap_figure(label: str, entries: list[Json]) -> CaptionedFigures:
     yield CaptionedFigure(f"gaps_{label}", f"{label} over the gap", GAP_CAPTION, figure)
 
 
-def _plot_branches(ax: Axes, case: Json, width: float) -> None:
-    gap = case["gap_mm"]
-    for interval in case["hysteresis"]:
+def _plot_branches(ax: Axes, case: CaseSummary, width: float) -> None:
+    gap = case.gap_mm
+    for interval in case.hysteresis:
         height_hz = max(
-            interval["to_hz"] - interval["from_hz"], 0.02
+            interval.to_hz - interval.from_hz, 0.02
         )  # keeps an interval of a single grid frequency visible
         ax.bar(
             gap,
             height_hz,
             width,
-            interval["from_hz"],
-            color=HYSTERESIS_COLOURS[interval["kind"]],
+            interval.from_hz,
+            color=HYSTERESIS_COLOURS[interval.kind],
             lw=0.6,
             ec="#b0b0b0",
         )
-    for jump in case["jumps"]:
-        middle_hz = (jump["from_hz"] + jump["to_hz"]) / 2
+    for jump in case.jumps:
+        middle_hz = (jump.from_hz + jump.to_hz) / 2
         ax.plot(
             gap,
             middle_hz,
-            JUMP_MARKERS[jump["kind"]],
-            color=DIRECTION_COLOURS[jump["direction"]],
+            JUMP_MARKERS[jump.kind],
+            color=DIRECTION_COLOURS[jump.direction],
             ms=6,
             zorder=4,
         )
 
 
-def _legend_handles(cases: list[Json]) -> list[Line2D | Patch]:
+def _legend_handles(cases: list[CaseSummary]) -> list[Line2D | Patch]:
     """Return legend handles of the plotted kinds only."""
     handles: list[Line2D | Patch] = [
         Line2D([], [], color=TWIN_COLOUR, marker="o", ms=3, label=r"largest $\eta_d$")
     ]
-    kinds = sorted({interval["kind"] for case in cases for interval in case["hysteresis"]})
+    kinds = sorted({interval.kind for case in cases for interval in case.hysteresis})
     handles += [
         Patch(fc=HYSTERESIS_COLOURS[kind], ec="#b0b0b0", label=f"{kind} hysteresis")
         for kind in kinds
     ]
-    jumps = sorted({(jump["direction"], jump["kind"]) for case in cases for jump in case["jumps"]})
+    jumps = sorted({(jump.direction, jump.kind) for case in cases for jump in case.jumps})
     return handles + [
         Line2D(
             [],

@@ -1,0 +1,214 @@
+"""Task: compute a map, outcomes of the model over any of its parameters; resumable."""
+
+import os
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from table_io.clock import RealClock
+from table_io.errors import InputError, require_package
+from twin.setup.disk import format_size, free_bytes
+from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
+from twin.setup.run_config import make_run_id
+from twin.studies import DEFINITION_FILE
+from twin.studies.maps.compute import compute_chunk, compute_outcomes, make_sweep_plan
+from twin.studies.maps.page import write_map_page
+from twin.studies.maps.sampling import sample_parameters
+from twin.studies.maps.store import (
+    Json,
+    Manifest,
+    create_store,
+    estimate_bytes_per_case,
+    make_seeds,
+    open_group,
+    read_definition,
+    remove_partial_files,
+    remove_unfinished_store,
+    require_same_study,
+)
+from twin.studies.maps.study import Study
+from twin.system.grid import Watch, format_time_span, run_grid
+from twin.system.process_pool import Workers
+
+TRIAL_CASES = 4  # spread over the study, computed beforehand to estimate its duration
+MAX_CHUNK_S = 24 * 3600.0
+
+
+@dataclass(frozen=True, slots=True)
+class MapOptions:
+    """A study file, or the folder of a study that was started, to `resume` it.
+
+    On `workers` processes, or on the Dask cluster at the address `scheduler`.
+    """
+
+    study: Path
+    out: Path | None = None
+    workers: int | None = None
+    scheduler: str = ""
+    resume: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class StoredMap:
+    """The folder of a map, its page, and how many of its cases are stored."""
+
+    folder: Path
+    page: Path
+    stored: int
+    total: int
+    stop_reason: str | None
+
+    @property
+    def is_complete(self) -> bool:
+        return self.stored == self.total
+
+
+def require_packages() -> None:
+    """Raise InputError if a package that maps need is not installed."""
+    for package in ("xarray", "zarr"):
+        require_package(package, "studies", "map")
+
+
+def compute_map(options: MapOptions, watch: Watch | None = None) -> StoredMap:
+    """Compute the cases of a study that are not stored yet; write its page.
+
+    Read the results by `open_study`. InputError for a faulty study, for one that does not fit into
+    memory or on the disk, and if a chunk cannot be computed or stored.
+    """
+    require_packages()
+    watch = watch or Watch()
+    path, out = options.study, options.out
+    workers = Workers.from_options(options.workers, options.scheduler)
+    if options.resume and (path / DEFINITION_FILE).is_file():
+        if out not in (None, path):
+            raise InputError(
+                "the study goes on where it is", where=path, key="--out", value=str(out),
+                remedy="omit it",
+            )  # fmt: skip
+        study, out = Study.from_definition(read_definition(path), str(path)), path
+    else:
+        study = Study.read(path)
+    workers.require()
+    folder = _open_folder(study, path, out, options.resume)
+    manifest = Manifest(folder, [variable.name for variable in study.variables])
+    config = study.config
+    _require_disk_space(study, folder, config.case_count - manifest.case_count)
+    watch.tell(config.title)
+    watch.tell(_describe_size(study))
+    if not options.resume:
+        create_store(folder, study, make_sweep_plan(study), sample_parameters(config))
+    group = open_group(folder, "r")
+    manifest.start(group)
+    if missing_count := config.case_count - manifest.case_count:
+        watch.tell(_describe_plan(study, group, workers, missing_count))
+    _run_chunks(folder, study, manifest, workers, watch)
+    if manifest.case_count == config.case_count:
+        manifest.finish()
+    page = write_map_page(folder)
+    return StoredMap(folder, page, manifest.case_count, config.case_count, watch.find_stop())
+
+
+def _estimate_seconds_per_case(study: Study, group: Any) -> float:
+    """Return the time of a case in s, from a few that are spread over the study."""
+    shares = (np.arange(TRIAL_CASES) + 0.5) / TRIAL_CASES
+    indices = (shares * study.config.case_count).astype(int)
+    names = [parameter.name for parameter in study.config.parameters]
+    values = np.stack([group[name].oindex[indices] for name in names], axis=1)
+    seeds = make_seeds(study.config.seed, range(TRIAL_CASES))
+    clock = RealClock()
+    compute_outcomes(study, values[:1], seeds[:1])  # compiles
+    started_s = clock.now()
+    compute_outcomes(study, values, seeds)
+    return (clock.now() - started_s) / TRIAL_CASES
+
+
+def _describe_size(study: Study) -> str:
+    """Return how many cases there are: of many millions, listing them takes a while."""
+    config, steps = study.config, study.profile.sweep.steps
+    shape = " x ".join(map(str, config.shape)) + " = " if len(config.shape) > 1 else ""
+    return f"{shape}{config.case_count} cases of {len(steps)} steps in {config.chunk_count} chunks"
+
+
+def _describe_plan(study: Study, group: Any, workers: Workers, missing_count: int) -> str:
+    """Return what the missing cases take, from a few of them."""
+    seconds = _estimate_seconds_per_case(study, group) * missing_count
+    size = estimate_bytes_per_case(study, make_sweep_plan(study)) * missing_count
+    duration = (
+        f"about {format_time_span(seconds)} of one core on {workers}"
+        if workers.scheduler
+        else f"about {format_time_span(seconds / workers.count)} on {workers}"
+    )
+    return f"{missing_count} to compute: {duration}, at most {format_size(size)} unpacked"
+
+
+def _open_folder(study: Study, path: Path, out: Path | None, resume: bool) -> Path:
+    """Return the folder of the study: a new one, or with `resume` the one of an earlier start."""
+    if not resume:
+        _require_memory(study)
+        if out is not None:
+            remove_unfinished_store(out)
+        return make_output_folder(out, make_run_id(f"{path.stem}-map"))
+    if out is None:
+        raise InputError("missing", key="--out", remedy="give the folder of the study to resume")
+    require_same_study(out, study)
+    claim_folder(out)
+    remove_partial_files(out)
+    return out
+
+
+def _require_memory(study: Study) -> None:
+    """Raise InputError if the list of cases does not fit into memory."""
+    needed = 3 * 8 * study.config.case_count * len(study.config.parameters)
+    available = os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > available:
+        raise InputError(
+            f"{study.config.case_count} cases take {format_size(needed)} of memory, and "
+            f"{format_size(available)} are free; nothing was started",
+            key="parameters",
+            remedy="give fewer values",
+        )
+
+
+def _require_disk_space(study: Study, folder: Path, missing_count: int) -> None:
+    """Raise InputError if the missing results do not fit on the folder's disk, uncompressed."""
+    needed = estimate_bytes_per_case(study, make_sweep_plan(study)) * missing_count
+    free = free_bytes(folder)
+    if needed > free:
+        raise InputError(
+            f"{format_size(free)} free on its disk, but the results take up to "
+            f"{format_size(needed)}; nothing was started",
+            where=folder,
+            remedy="make room, give another disk with --out, or compute fewer outcomes",
+        )
+
+
+def _run_chunks(
+    folder: Path, study: Study, manifest: Manifest, workers: Workers, watch: Watch
+) -> None:
+    """Compute the chunks that are not stored and list each; InputError if one cannot be."""
+    shared = folder.resolve()
+    definition = (shared / DEFINITION_FILE).read_text(encoding="utf-8")
+
+    def describe_failure(number: int, reason: str) -> InputError:
+        return InputError(
+            f"chunk {number} failed: {reason}; the chunks before it are kept",
+            where=folder,
+            remedy="remove the cause and continue with --resume",
+        )
+
+    def keep(number: int, entry: Json) -> int:
+        if reason := entry.get("error", ""):
+            raise describe_failure(number, reason)
+        manifest.add(entry)
+        return int(entry["cases"])
+
+    run_grid(
+        partial(compute_chunk, shared),
+        [n for n in range(study.config.chunk_count) if n not in manifest.entries],
+        workers, keep, watch, unit="cases", total=study.config.case_count,
+        done=manifest.case_count, describe_failure=describe_failure, max_task_s=MAX_CHUNK_S,
+        find_problem=partial(find_sharing_problem, shared / DEFINITION_FILE, definition),
+    )  # fmt: skip
