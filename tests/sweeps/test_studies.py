@@ -27,7 +27,7 @@ from twin.setup.run_config import read_model
 from twin.simulation.command import simulate_profile
 from twin.studies import figures
 from twin.studies.cases import parse_gaps_mm
-from twin.studies.result import COLUMNS, read_batch_rows
+from twin.studies.result import COLUMNS, SweepSummary, read_batch_rows
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 TEST = """
@@ -323,7 +323,7 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
     (gaps,) = figures.draw_gap_figure(
-        "snm", [case for case in summary(out)["cases"] if case["model"] == "snm"]
+        "snm", [case for case in SweepSummary.read(out).cases if case.model == "snm"]
     )
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 
