@@ -49,4 +49,4 @@ def test_a_case_is_the_sweep_of_its_model_from_rest() -> None:
         simulate_case(batch, number)
     assert simulate_case(batch, 1).rows == result.rows
     assert simulate_case(batch, 3).rows != result.rows
-    json.dumps(result.entry.model_dump(), allow_nan=False)
+    json.dumps(result.entry.to_plain(), allow_nan=False)

@@ -323,7 +323,8 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
     (gaps,) = figures.draw_gap_figure(
-        "snm", [case for case in SweepSummary.read(out).cases if case.model == "snm"]
+        "snm",
+        [case for case in SweepSummary.read(out / "summary.json", "").cases if case.model == "snm"],
     )
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 

@@ -118,5 +118,5 @@ def _summarise_case(
         jumps=make_jumps(jumps),
         hysteresis=make_intervals(intervals),
         unbounded_from=next(iter(unbounded), None),
-        warnings=[*map(str, range_exits)],
+        warnings=tuple(map(str, range_exits)),
     )

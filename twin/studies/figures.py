@@ -35,7 +35,6 @@ from twin.drawing.plot_style import (
     save_figures,
 )
 from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_panels, plot_prc
-from twin.results.contract import Json
 from twin.results.report_data import Curve
 from twin.studies.cases import format_gap_mm
 from twin.studies.result import CaseSummary, Row, SweepSummary

@@ -49,7 +49,7 @@ class CaseSummary(Contract):
     jumps: list[Jump]
     hysteresis: list[HysteresisInterval]
     unbounded_from: Point | None
-    warnings: list[str] = []
+    warnings: tuple[str, ...] = ()
 
     @field_serializer("gap_mm")
     def _name_gap(self, gap_mm: float) -> float | str:
