@@ -12,6 +12,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.provenance import Provenance
 from table_io.config.toml_text import format_toml
 from tests.command_line import call_main
+from tests.sweeps.small_study import read_stored_bytes, write_study
 from twin import api
 from twin.cli.table import COMMANDS
 from twin.results.contract import format_json
@@ -28,6 +29,7 @@ TASKS = {
     "export": ("export_log",),
     "identify": ("identify",),
     "import": ("import_table",),
+    "map": ("compute_map",),
     "table-drive": ("compute_drive",),
     "table-twin": ("identify_table",),
     "verify": ("verify", "repair_log"),
@@ -110,6 +112,14 @@ def compare_imports(log: Path, folder: Path) -> tuple[object, object]:
     return imported.predicted.tobytes(), other.predicted.tobytes()
 
 
+def compare_maps(log: Path, folder: Path) -> tuple[object, object]:
+    study = write_study(folder)
+    assert call_main("map", study, "--workers", 1, "--out", folder / "shell").returncode == 0
+    stored = api.compute_map(api.MapOptions(study, folder / "python", workers=1))
+    assert stored.is_complete
+    return read_stored_bytes(stored.folder), read_stored_bytes(folder / "shell")
+
+
 def compare_plans(log: Path, folder: Path) -> tuple[object, object]:
     """Of a test whose model was identified at another mass."""
     text = (PROFILES_DIR / "models" / "snm.toml").read_text()
@@ -122,6 +132,18 @@ def compare_plans(log: Path, folder: Path) -> tuple[object, object]:
     lines = call_main("check", folder / "test.toml").stdout.splitlines()
     shown = [line.partition(": ")[2] for line in lines if line.startswith("warning: ")]
     return [*checked.warnings], shown
+
+
+def compare_sweeps(log: Path, folder: Path) -> tuple[object, object]:
+    words = ("--gap", "4", "--gap", "inf", "--workers", 1, "--out", folder / "shell")
+    assert call_main("simulate", "quickstart", *words).returncode == 0
+    quickstart = PROFILES_DIR / "tests" / "quickstart.toml"
+    options = api.SweepOptions(quickstart, gaps=("4", "inf"), workers=1, out=folder / "python")
+    simulated = api.simulate_sweeps(options)
+    written = read_json(folder / "shell" / "summary.json")
+    tables = [(each / "batch.csv").read_text() for each in (simulated.folder, folder / "shell")]
+    cases = json.loads(simulated.summary.to_json())["cases"]
+    return (cases, tables[0]), (written["cases"], tables[1])
 
 
 def compare_repairs(log: Path, folder: Path) -> tuple[object, object]:
@@ -156,8 +178,10 @@ def compare_wirings(log: Path, folder: Path) -> tuple[object, object]:
         compare_exports,
         compare_fits,
         compare_imports,
+        compare_maps,
         compare_plans,
         compare_repairs,
+        compare_sweeps,
         compare_verifications,
         compare_wirings,
     ],
