@@ -1,5 +1,6 @@
 """One thread for matrices, as in a run; coarse pictures; more time for long studies; fixtures."""
 
+import gc
 import os
 import runpy
 import sys
@@ -33,6 +34,12 @@ def pytest_configure(config: pytest.Config) -> None:
     if config.getoption("benchmark_only"):
         config.option.benchmark_enable = True
         config.option.dist, config.option.tx, config.option.numprocesses = "no", [], 0
+
+
+def pytest_collection_finish() -> None:
+    """Spare the collector all that lives as long as the session: modules and tests."""
+    gc.collect()
+    gc.freeze()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -172,7 +172,9 @@ def test_gaps_that_open_are_seen_on_both_sides_and_the_stiffness_is_left_alone()
 @pytest.mark.parametrize(
     "channel, gain, named, number",
     [
-        ("mass_acc_m_s2", 1.1, "mass_acc_m_s2 and mass_disp_m", 1.1),
+        pytest.param(
+            "mass_acc_m_s2", 1.1, "mass_acc_m_s2 and mass_disp_m", 1.1, marks=pytest.mark.slow
+        ),
         pytest.param(
             "mass_disp_m", 0.9, "mass_acc_m_s2 and mass_disp_m", 1 / 0.9, marks=pytest.mark.slow
         ),
@@ -436,7 +438,10 @@ def test_a_twin_that_begins_in_motion_says_nothing_wrong_and_the_same_however_cu
     "truth, expected",
     [
         ("cubic_stiffness k3=1e8; sensor_offset.mass_disp_m offset=1e-3", {"gap_r": GAP}),
-        ("cubic_stiffness k3=1e8; sensor_gain.mass_disp_m gain=1.1", {"stiffness": STIFFNESS}),
+        pytest.param(
+            "cubic_stiffness k3=1e8; sensor_gain.mass_disp_m gain=1.1", {"stiffness": STIFFNESS},
+            marks=pytest.mark.slow,
+        ),
         ("cubic_stiffness k3=1e8; sensor_gain.force_r1_n gain=0.8",
          {"bumper_stiffness_r": 510e3}),
         ("gap_drift rate=3e-6", {"gap_r": GAP, "gap_l": GAP}),

@@ -53,7 +53,10 @@ def test_where_nothing_is_hidden_nothing_is_named() -> None:
     [
         (format_truth("bumper_hardening", k2=3e7), EffectKey("bumper_hardening", "k2"), 3e7),
         (format_truth("coulomb_friction", fc=30.0), EffectKey("coulomb_friction", "fc"), 30.0),
-        (format_truth("maxwell_damper", k1=8e3, tau=0.05), EffectKey("maxwell_damper", "k1"), 8e3),
+        pytest.param(
+            format_truth("maxwell_damper", k1=8e3, tau=0.05),
+            EffectKey("maxwell_damper", "k1"), 8e3, marks=pytest.mark.slow,
+        ),
         (format_truth("gap_offset", offset=8e-5), EffectKey("gap_offset", "offset"), 8e-5),
         (
             format_truth("sensor_gain", "mass_acc_m_s2", gain=1.04),

@@ -137,6 +137,7 @@ def list_terms(scale, *families):
     return [term for term in list_law_candidates(scale, has_contact=False) if term.name in names]
 
 
+@pytest.mark.slow  # 9 s
 def test_friction_behind_slack_is_distinguished_from_plain_hysteresis(monkeypatch):
     families = ("hysteresis", "slack_hysteresis", "constant_force", "even_spring")
     monkeypatch.setattr(

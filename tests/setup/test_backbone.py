@@ -109,6 +109,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, PlayedS
     return profile, play_session(profile)
 
 
+@pytest.mark.slow  # 14 s with those of the same session
 def test_backbone_is_that_of_the_plant(measured) -> None:
     points = measured[1].select(OrbitPoint)
     assert [(point.step, point.accepted, point.reason) for point in points] == [
@@ -123,6 +124,7 @@ def test_backbone_is_that_of_the_plant(measured) -> None:
         assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=4e-3)
 
 
+@pytest.mark.slow  # 14 s with those of the same session
 def test_feedback_vanished_in_phase_within_100_periods(measured) -> None:
     for point in measured[1].select(OrbitPoint):
         assert math.hypot(*point.feedback_m) <= 0.003 * point.command_m
@@ -130,6 +132,7 @@ def test_feedback_vanished_in_phase_within_100_periods(measured) -> None:
         assert point.periods <= 100
 
 
+@pytest.mark.slow  # 14 s with those of the same session
 def test_nothing_is_lost_and_the_command_ends_at_rest(measured) -> None:
     result = measured[1]
     assert not [event for event in result.select(Event) if event.kind == "lost"]

@@ -391,6 +391,7 @@ def test_options_that_exclude_each_other_are_refused(whole_study: Path, tmp_path
         command.run_study(MapOptions(tmp_path, None, None), True)
 
 
+@pytest.mark.slow  # 8 s
 def test_a_scheduler_that_does_not_answer_leaves_no_folder(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

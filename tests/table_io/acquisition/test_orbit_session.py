@@ -129,6 +129,7 @@ def test_run_is_reproduced_to_the_bit(held: PlayedSession) -> None:
     assert again.command_m[:count].tobytes() == held.command_m[:count].tobytes()
 
 
+@pytest.mark.slow  # 7 s
 def test_lost_orbit_is_left_for_rest_and_found_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """The feedback sees a deviation that is none, and pushes the motion off its orbit."""
     pushed = range(round(27.0 * RATE_HZ), round(29.0 * RATE_HZ))

@@ -47,7 +47,7 @@ REST_SAMPLES = round(profile().acquisition.rest_s * RATE_HZ)
 BLOCK_COUNT = plan_sweep(profile()).planned_end // BLOCK_SAMPLES
 FIRST_MOVING = sine_segments(plan_sweep(profile()))[0].start // BLOCK_SAMPLES + 1
 LAW = settings(
-    max_examples=12,
+    max_examples=6,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
@@ -135,7 +135,7 @@ def test_first_end_that_was_ordered_counts(first: str, others: list[str], after:
 
 
 @pytest.mark.parametrize("ending", ["complete", "stop", "abort", "trip", "underrun", "hold"])
-@pytest.mark.parametrize("after", [FIRST_MOVING, 300, 611])
+@pytest.mark.parametrize("after", [FIRST_MOVING, 611])
 def test_no_session_ends_before_its_queue_has_run_out(
     ending: str, after: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
