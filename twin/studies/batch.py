@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import chain
+from typing import Any
 
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
@@ -18,7 +19,14 @@ from twin.model.valid_range import RangeExit, select_first_exits
 from twin.results import ideal_points
 from twin.results.summary import make_intervals, make_jumps
 from twin.studies.cases import StudyCase, build_cases
-from twin.studies.result import IMPACT_COLUMNS, RATIO_COLUMNS, CaseSummary, Peak, Point, Row
+from twin.studies.result import (
+    IMPACT_COLUMNS,
+    RATIO_COLUMNS,
+    CaseSummary,
+    Row,
+    SweepPeak,
+    SweepPoint,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,16 +106,13 @@ def _summarise_case(
     """Return the entry of a case in summary.json."""
     u_star, a_star, peak_hz = free_flight_resonance(case.model.parameters, acceleration_m_s2)
     jumps, intervals = detect_hysteresis(points, "twin")
-    bounded = [
-        Peak(frequency_hz=point.frequency_hz, direction=point.direction, eta_d=point.twin.eta_d)
-        for point in points
-        if point.twin and math.isfinite(point.twin.eta_d)
-    ]
-    unbounded = [
-        Point(frequency_hz=point.frequency_hz, direction=point.direction)
-        for point in points
-        if not point.twin or not math.isfinite(point.twin.eta_d)
-    ]
+    bounded, unbounded = [], []
+    for point in points:
+        place: dict[str, Any] = {"frequency_hz": point.frequency_hz, "direction": point.direction}
+        if point.twin and math.isfinite(point.twin.eta_d):
+            bounded.append(SweepPeak(**place, eta_d=point.twin.eta_d))
+        else:
+            unbounded.append(SweepPoint(**place))
     return CaseSummary(
         model=case.label,
         gap_mm=case.gap_mm,

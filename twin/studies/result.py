@@ -21,14 +21,14 @@ TEXT_COLUMNS = ("model", "direction")
 REMEDY = "give a folder written by simulate"
 
 
-class Point(Contract):
+class SweepPoint(Contract):
     """A step of the sweep."""
 
     frequency_hz: float
     direction: str
 
 
-class Peak(Point):
+class SweepPeak(SweepPoint):
     """The step of the largest eta_d."""
 
     eta_d: float
@@ -45,10 +45,10 @@ class CaseSummary(Contract):
     u_star_m: float
     a_star_m_s2: float
     free_flight_hz: float
-    peak: Peak | None
+    peak: SweepPeak | None
     jumps: list[Jump]
     hysteresis: list[HysteresisInterval]
-    unbounded_from: Point | None
+    unbounded_from: SweepPoint | None
     warnings: tuple[str, ...] = ()
 
     @field_serializer("gap_mm")
