@@ -6,7 +6,6 @@ The one-line text of a record is the same on the terminal, in the viewer and in 
 
 import math
 from dataclasses import dataclass, field
-from typing import get_args
 
 from table_io.block import Label
 from table_io.units import GRAVITY_M_S2
@@ -412,7 +411,6 @@ Record = (
     | JumpForecast
     | RunStop
 )
-RECORD_TYPES: tuple[type, ...] = get_args(Record)
 
 LABEL_TEXTS = {
     Label.REST: "at rest",

@@ -25,23 +25,9 @@ def volts_to_si(
     return volts * slope[:, None] - offset[:, None]
 
 
-def si_to_volts(
-    values: Float2D, sensors: tuple[SensorConfig, ...], tare: dict[str, float]
-) -> Float2D:
-    """Convert SI values, (channel, sample), to volts; the inverse of `volts_to_si`."""
-    slope = np.array([sensor.volts_per_si for sensor in sensors])
-    offset = np.array([tare.get(sensor.channel, 0.0) for sensor in sensors])
-    return (values + offset[:, None]) * slope[:, None]
-
-
 def command_to_volts(displacement_m: Float1D, output: OutputConfig) -> Float1D:
     """Convert a displacement in m, (sample,), to volts of the command channel."""
     return displacement_m * output.volts_per_m
-
-
-def command_to_si(volts: Float1D, output: OutputConfig) -> Float1D:
-    """Convert volts of the command channel, (sample,), to displacement in m."""
-    return volts / output.volts_per_m
 
 
 def compute_tare(volts: Float2D, sensors: tuple[SensorConfig, ...]) -> dict[str, float]:

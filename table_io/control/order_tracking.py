@@ -36,11 +36,6 @@ class HarmonicFit:
         """Amplitude of the fundamental."""
         return float(abs(self.amplitudes[0]))
 
-    @property
-    def distortion(self) -> float:
-        """Total harmonic distortion (THD): rss of harmonics 2 to n over the fundamental."""
-        return float(np.sqrt(np.sum(np.abs(self.amplitudes[1:]) ** 2)) / abs(self.amplitudes[0]))
-
 
 NO_FIT = HarmonicFit(float("nan"), np.full(HARMONIC_COUNT, complex("nan")), float("nan"))
 

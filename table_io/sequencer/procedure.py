@@ -370,14 +370,9 @@ def start_test(plan: TestPlan) -> SequencerState:
     return SequencerState(plan, trajectory, trajectory.to_drive(steps), stage, steps)
 
 
-def advance_test(
-    state: SequencerState, block: Block, earliest: int = 0
-) -> tuple[SequencerState, tuple[Record, ...]]:
-    """Return (state, new records) after a measured block; blocks must come in order.
-
-    A feedback changes the command from sample `earliest` on at the soonest.
-    """
-    return answer_block(decide_block(state, block), block, earliest)
+def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, tuple[Record, ...]]:
+    """Return (state, new records) after a measured block; blocks must come in order."""
+    return answer_block(decide_block(state, block), block, 0)
 
 
 def decide_block(state: SequencerState, block: Block) -> SequencerState:

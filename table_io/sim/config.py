@@ -137,12 +137,6 @@ class HydraulicTableConfig(ConfigModel):
             )
         return frequency_hz
 
-    def oil_column_hz(self, mass_kg: float) -> float:
-        """Return the natural frequency of a moving mass in kg on the oil column, Hz."""
-        area_m2, volume_m3 = self.piston_area_cm2 * 1e-4, self.oil_volume_cm3 * 1e-6
-        stiffness_n_m = 4.0 * self.bulk_modulus_mpa * 1e6 * area_m2**2 / volume_m3
-        return math.sqrt(stiffness_n_m / mass_kg) / math.tau
-
 
 class FaultKind(NamedTuple):
     """Keys of a fault kind: channel needed, meaning of its size ("": none), its duration."""

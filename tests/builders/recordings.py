@@ -3,14 +3,19 @@
 Imports what computes only where a fixture is used.
 """
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
 
+from table_io.block import Block
+
 if TYPE_CHECKING:
+    from twin.recording.columns import StoredItems
     from twin.recording.reader import Recording
     from twin.setup.run_config import RunConfig
+    from twin.transport.codec import Item
 
 PROFILE = """
 title = "Across the down-jump and back"
@@ -58,3 +63,13 @@ def recording(log_file: Path) -> "Recording":
     from twin.recording.reader import read_recording
 
     return read_recording(log_file)
+
+
+def store_items(items: "Iterable[Item]") -> "StoredItems":
+    """Return items as a recording holds them, blocks in columns of their own."""
+    from twin.recording.columns import BlockStore, StoredItems
+
+    items = list(items)
+    count = sum(len(item) for item in items if isinstance(item, Block))
+    store = BlockStore(lambda _: count)
+    return StoredItems(store.add(item) if isinstance(item, Block) else item for item in items)

@@ -1,10 +1,16 @@
 """Rigs: those shipped, with other sensors, tables, faults or channels."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
+from table_io.block import Float1D, Float2D
 from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.rig import RigConfig
+from table_io.config.rig import OutputConfig, RigConfig
+from table_io.config.sensor import SensorConfig
+from table_io.sim.config import HydraulicTableConfig
 
 
 def read_rig_text(name: str) -> str:
@@ -111,3 +117,24 @@ LAB_TEXT = RIG_TEXT.replace('name = "simulated"', 'name = "lab"', 1) + DECLARED
 def make_lab_rig(**simulated: Any) -> RigConfig:
     """Return the rig of a laboratory that has more sensors than the canonical channels."""
     return change_rig(parse_toml(LAB_TEXT, RigConfig, "lab.toml"), simulated=simulated)
+
+
+def si_to_volts(
+    values: Float2D, sensors: tuple[SensorConfig, ...], tare: dict[str, float]
+) -> Float2D:
+    """Convert SI values, (channel, sample), to volts; the inverse of `volts_to_si`."""
+    slope = np.array([sensor.volts_per_si for sensor in sensors])
+    offset = np.array([tare.get(sensor.channel, 0.0) for sensor in sensors])
+    return (values + offset[:, None]) * slope[:, None]
+
+
+def command_to_si(volts: Float1D, output: OutputConfig) -> Float1D:
+    """Convert volts of the command channel, (sample,), to displacement in m."""
+    return volts / output.volts_per_m
+
+
+def compute_oil_column_hz(hydraulic: HydraulicTableConfig, mass_kg: float) -> float:
+    """Return the natural frequency of a moving mass in kg on the oil column, Hz."""
+    area_m2, volume_m3 = hydraulic.piston_area_cm2 * 1e-4, hydraulic.oil_volume_cm3 * 1e-6
+    stiffness_n_m = 4.0 * hydraulic.bulk_modulus_mpa * 1e6 * area_m2**2 / volume_m3
+    return math.sqrt(stiffness_n_m / mass_kg) / math.tau

@@ -10,6 +10,7 @@ from table_io.block import Label
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import check_limits
+from tests.laws.test_effect_files import read_effect
 from twin.discovery import decisive_test
 from twin.discovery.decisive_test import CandidateTest, list_candidate_tests
 from twin.discovery.discover import PreparedLog, PreparedProblem, prepare_problem
@@ -42,7 +43,6 @@ from twin.discovery.verdict import (
     DiscoveryVerdict,
     widen_for_form,
 )
-from twin.laws.effect_file import read_effect
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 from twin.model.prepare import prepare_solver

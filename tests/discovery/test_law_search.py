@@ -8,9 +8,10 @@ import pytest
 
 from tests.discovery.played import SNM, format_truth, imperfect_log, log
 from tests.recovery.recordings import log_columns, oscillator
+from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
 from twin.discovery.discover import prepare_problem
-from twin.discovery.law_search import find_law, find_law_of_base, propose_law, search_laws
+from twin.discovery.law_search import find_law, propose_law, search_laws
 from twin.discovery.law_terms import FAMILIES, LAW_PREFIX, list_law_candidates
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import EffectKey

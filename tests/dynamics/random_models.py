@@ -143,7 +143,7 @@ def find_missed(case: RandomCase, diagram: Diagram, starts: int, seed: int, find
             findings.irregular += 1
             continue
         findings.settled += 1
-        if diagram.find_branch(orbit) is None:
+        if not any(branch.contains(orbit) for branch in diagram.branches):
             findings.missed.append((frequency_hz, orbit.periods, float(abs(orbit.multipliers[0]))))
 
 

@@ -167,10 +167,11 @@ MODELS = {
 @pytest.mark.parametrize("name", MODELS)
 def test_every_orbit_of_any_model_is_periodic_and_admissible(name) -> None:
     orbit = settle(model_map(0.004, **MODELS[name]), 12.0)
-    branch = continue_branch(orbit, "frequency", (0.9, 12.0), check_admissibility=True)
+    branch = continue_branch(orbit, "frequency", (0.9, 12.0))
     assert [end.reason for end in branch.ends] == ["range end", "range end"]
     for point in branch.points:
         orbit = point.orbit
+        assert orbit.is_admissible()
         result = orbit.period_map.evaluate(orbit.x)
         residual = np.abs((result.end - orbit.x) / orbit.period_map.scales).max()
         assert residual < 1e-11 * max(1, abs(orbit.multipliers[0]))

@@ -93,7 +93,6 @@ def test_shock_spectrum_of_a_half_sine(ratio: float) -> None:
     assert shock.positive_m_s2[0] == pytest.approx(positive, rel=4.1e-3)
     assert shock.positive_m_s2[0] <= positive * (1 + 1e-6)
     assert shock.negative_m_s2[0] == pytest.approx(negative, rel=4.1e-3, abs=1e-6)
-    assert shock.maximax_m_s2[0] == max(shock.positive_m_s2[0], shock.negative_m_s2[0])
 
 
 def test_limits_of_the_spectrum() -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
+from tests.builders.rigs import compute_oil_column_hz
 from tests.earthquakes.hydraulic_rig import (
     RATE_HZ,
     SPECIMEN_KG,
@@ -71,7 +72,7 @@ def test_friction_and_oil_column_are_those_of_the_rig(
     p = result.model.parameters
     assert TABLE.hydraulic is not None
     assert p.friction_n == pytest.approx(friction_n, rel=0.15)
-    assert p.oil_hz == pytest.approx(TABLE.hydraulic.oil_column_hz(MASS_KG), rel=0.05)
+    assert p.oil_hz == pytest.approx(compute_oil_column_hz(TABLE.hydraulic, MASS_KG), rel=0.05)
     assert p.gain_1_s == pytest.approx(TABLE.hydraulic.gain_1_s, rel=0.05)
     assert p.frame_hz == pytest.approx(TABLE.hydraulic.frame_frequency_hz, rel=0.03)
 

@@ -10,7 +10,7 @@ from table_io.compilation import jit_helper
 from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from tests.discovery.played import SNM
-from twin.laws.effect_file import format_effect_file, read_effect
+from twin.laws.effect_file import EffectFile, format_effect_file
 from twin.laws.expression import FUNCTIONS, build_function, parse_expression, parse_unit
 from twin.laws.properties import evaluate_law
 from twin.model.added_laws import compile_laws
@@ -42,6 +42,10 @@ BRANCH = (
     + TAU
 )
 TILT = "id = 'lean'\nplace = 'input'\nforce = 'k * y'\n" + K.format(unit="1/s2", typical=1.0)
+
+
+def read_effect(text):
+    return parse_toml(text, EffectFile, "effect file").build_effect()
 
 
 def add(effect, **values):

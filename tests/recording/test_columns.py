@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
+from tests.builders.recordings import store_items
 from twin.recording.columns import BlockStore, StoredItems
 
 
@@ -37,7 +38,7 @@ def test_blocks_are_read_as_they_were_stored(capacity: int, places: list[tuple[i
 
 
 def test_samples_in_order_are_held_once() -> None:
-    items = StoredItems.from_items([make_block(first, 5) for first in range(0, 50, 5)])
+    items = store_items([make_block(first, 5) for first in range(0, 50, 5)])
     (joined,) = items.contiguous_blocks("meas")
     assert all(
         np.shares_memory(item.values, joined.values) for item in items if isinstance(item, Block)
@@ -46,7 +47,7 @@ def test_samples_in_order_are_held_once() -> None:
 
 def test_blocks_of_other_channels_are_kept_apart() -> None:
     blocks = [make_block(0, 5), make_block(5, 5, ("a",)), make_block(10, 5)]
-    items = StoredItems.from_items(blocks)
+    items = store_items(blocks)
     read = [item for item in items if isinstance(item, Block)]
     assert all(block.is_identical(original) for block, original in zip(read, blocks, strict=True))
     assert [block.channels for block in items.contiguous_blocks("meas")] == [

@@ -21,11 +21,11 @@ from table_io.records import (
     RunStart,
     RunStop,
 )
+from tests.builders.recordings import store_items
 from tests.input_errors import raises_input_error
 from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline, twins
 from twin.compare.monitoring import EVENT_KINDS
-from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.tabular import parse_step_range
@@ -201,7 +201,7 @@ def test_parameters_that_changed_are_changed_again(
     assert identity.is_identical
     assert encode_records(made, Params, PrcPoint) == encode_records(other, Params, PrcPoint)
     # without the change the twin goes another way from there on
-    ignored = replace(other, items=StoredItems.from_items(
+    ignored = replace(other, items=store_items(
         item for item in other.items
         if not (isinstance(item, Params) and item.reason == "identified")
     ))  # fmt: skip
@@ -227,7 +227,7 @@ def test_a_change_within_a_gap_holds_after_it(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     other = change_parameters(recording, bundle, 2013, tmp_path / "changed.mcap")
-    holed = replace(other, items=StoredItems.from_items(
+    holed = replace(other, items=store_items(
         item for item in other.items if not isinstance(item, Block) or not 2000 <= item.index < 2100
     ))  # fmt: skip
     _, made = again(recorded_in(holed), bundle, tmp_path / "run.mcap")

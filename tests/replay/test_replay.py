@@ -11,9 +11,9 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import Comparison, Event, Fault, Params, PrcPoint, Record, RunStart, RunStop
+from tests.builders.recordings import store_items
 from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline
-from twin.recording.columns import StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import ReplayComparison, replay_recording
@@ -182,7 +182,7 @@ def test_replay_is_dead_where_the_twin_was(
     for a, b in spans:
         assert not any(block.index < b and block.end > a for block in made.blocks("pred"))
     # after the fresh start it differs from a twin that never died, so the fault mattered
-    never, _ = again(replace(died, items=StoredItems.from_items(
+    never, _ = again(replace(died, items=store_items(
         item for item in died.items if not isinstance(item, Fault)
     )), bundle, tmp_path)  # fmt: skip
     assert not never.is_identical

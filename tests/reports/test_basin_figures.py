@@ -38,7 +38,7 @@ def test_every_figure_is_drawn(tmp_path, dark):
         yield draw_basin_fractions(results, "frequency", values)
         yield draw_section(record_section(POINT, 0.0, 0.0, 50), "3.4 Hz")
         up = follow_attractor(POINT, "gap", np.array([2e-3, 4e-3]))
-        yield draw_bifurcation_diagram(up, up, up, find_chaotic_bands([up], 1e-4))
+        yield draw_bifurcation_diagram(up, up, find_chaotic_bands([up], 1e-4))
 
     pictures = save_figures(figures(), tmp_path, dark)
     assert len(pictures) == 4

@@ -11,11 +11,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from table_io.block import Block
 from table_io.records import Params
+from tests.builders.recordings import store_items
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import STEPS, blocks, one_step, signals, summary
 from twin.drawing.plot_style import PRECOMPRESSION_COLOUR, QuickLayout
 from twin.model.parameters import Parameters
-from twin.recording.columns import StoredItems
 from twin.recording.reader import read_recording
 from twin.report.figures import draw_run_figures
 from twin.report.report import load_report_data
@@ -91,9 +91,7 @@ def test_precompression_is_that_of_the_recorded_model_or_of_its_card(run_folder:
     items, values = one_step()
     run = build_precompressed(run_folder([Params(0, MODEL, "start"), *items], values, "-1.0"))
     start = replace(run.recording.start, model_toml=CARD.read_text(encoding="utf-8"))
-    by_card = replace(
-        run, recording=replace(run.recording, start=start, items=StoredItems.from_items(items))
-    )
+    by_card = replace(run, recording=replace(run.recording, start=start, items=store_items(items)))
     eta, r = 0.5e-3 / 0.030537, 510e3 * 0.5e-3 / (550.0 * 9.80665)
     for folder_run in (run, by_card):
         assert compute_prestress(folder_run) == pytest.approx(

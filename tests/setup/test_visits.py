@@ -8,7 +8,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
-from twin.recording.columns import StoredItems
+from tests.builders.recordings import store_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.report.report import format_headline
@@ -93,9 +93,7 @@ def test_visits_that_a_dead_twin_missed_are_measured_all_the_same(run: tuple) ->
     end = recording.stop.index
     fault = Fault(end, "twin", 0, end, "it died")
     kept = tuple(item for item in recording.items if not isinstance(item, PrcPoint))
-    rebuilt = summarise(
-        replace(recording, items=StoredItems.from_items([*kept, fault])), bundle.parameters
-    )
+    rebuilt = summarise(replace(recording, items=store_items([*kept, fault])), bundle.parameters)
     assert [visit.measured for visit in rebuilt.visits] == [
         visit.measured for visit in summary.visits
     ]

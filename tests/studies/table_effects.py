@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from tests.builders.rigs import compute_oil_column_hz
 from tests.earthquakes.hydraulic_rig import TABLE
 from tests.earthquakes.planted_tables import SIZES, PlantedTable, draw_table, record_rehearsal
 from twin.earthquakes.table_effects import EFFECT_BY_ID, describe_size, discover_table_effects
@@ -41,7 +42,7 @@ def find_truth(table: PlantedTable) -> dict[str, float]:
     config = TABLE.hydraulic.model_copy(update=dict(table.hydraulic))
     return {
         "friction_n": config.friction_n,
-        "oil_hz": config.oil_column_hz(MASS_KG),
+        "oil_hz": compute_oil_column_hz(config, MASS_KG),
         "gain_1_s": config.gain_1_s,
         "velocity_feedforward": config.velocity_feedforward,
         "frame_hz": config.frame_frequency_hz,

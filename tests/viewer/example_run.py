@@ -31,8 +31,8 @@ from table_io.records import (
     Step,
     Timing,
 )
+from tests.builders.recordings import store_items
 from twin.compare import TWIN_CHANNELS
-from twin.recording.columns import StoredItems
 from twin.recording.reader import Recording
 
 RATE_HZ = 2000.0
@@ -128,7 +128,7 @@ def records() -> list[Record]:
 def recording(items: Sequence[Block | Record], begin: RunStart | None = None) -> Recording:
     begin = begin or start()
     ordered = sorted(items, key=lambda item: item.index)
-    return Recording(Path("run.mcap"), "r1", begin, StoredItems.from_items([begin, *ordered]), True)
+    return Recording(Path("run.mcap"), "r1", begin, store_items([begin, *ordered]), True)
 
 
 @cache

@@ -57,7 +57,6 @@ MIN_CYCLES, MAX_CYCLES = 4, 60  # held at each frequency
 DWELL_SCHEDULE_DB = (-12.0, -6.0, 0.0)  # levels of a dwell, which grows
 GAP_RATIOS = (math.inf, 0.5, 2.0)  # to the gap of the recorded test; inf: without bumpers
 SIGNIFICANT_DIGITS = 3  # significant, of frequencies and levels
-MAX_DRAWS = 1000  # of a random test
 MIN_PROBABILITY = 0.05  # of a decision, below which a test is not worth its time
 # Tables of a recorded test that are about that run alone.
 OWN_TABLES = ("sweep", "excitation", "dwell", "track", "refine", "resume", "set_up", "tracking")
@@ -330,27 +329,6 @@ def list_candidate_tests(
             own = {"title": f"{title}, {gap}", "excitation": excitation, "specimen": specimen}
             tests += _build_tests(kept | own, recorded, rig_toml, f"set: {gap}")
     return [test for test in tests if test.minutes <= max_min]
-
-
-def draw_random_test(
-    recorded: RunStart, rig_toml: str, minutes: float, generator: np.random.Generator
-) -> CandidateTest:
-    """Draw a stepped sine within the limits of the rig, of about this duration in min.
-
-    Ends of its band and its level are log-uniform over the range of the candidate tests.
-    """
-    profile, kept = _read_profile(recorded)
-    low_hz, high_hz, level_g = _measure_test(profile)
-    limits_hz = np.log([low_hz / BAND_RATIO, high_hz * BAND_RATIO])
-    limits_g = np.log([level_g * min(LEVEL_RATIOS), level_g * max(LEVEL_RATIOS)])
-    for _ in range(MAX_DRAWS):
-        ends_hz = np.sort(np.exp(generator.uniform(limits_hz[0], limits_hz[1], size=2)))
-        level = float(np.exp(generator.uniform(limits_g[0], limits_g[1])))
-        sweep = _make_sweep((float(ends_hz[0]), float(ends_hz[1])), level, duration_s=60 * minutes)
-        content = kept | {"title": "random test", "excitation": sweep}
-        if tests := _build_tests(content, recorded, rig_toml):
-            return tests[0]
-    raise InputError("the rig can play no random test", where=f"recording {recorded.run}")
 
 
 def _read_profile(recorded: RunStart) -> tuple[Profile, Table]:

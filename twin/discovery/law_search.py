@@ -17,7 +17,6 @@ from twin.discovery.discover import (
     Discovery,
     PreparedProblem,
     add_nuisances,
-    sensors_disagree,
     widen_with_ideal,
 )
 from twin.discovery.law_terms import (
@@ -134,25 +133,6 @@ def _propose_law_of(
             ideal, prepared, starts, verdict.floor, nearest_name, report
         )
     return None if law is None else (replace(discovery, prepared=prepared), law)
-
-
-def find_law_of_base(
-    prepared: PreparedProblem,
-) -> tuple[SelectionProblem, FittedSet, LawProposal | None]:
-    """Return (problem, its base, law) without a search of the library before.
-
-    With nuisances where sensors disagree and no law suffices with ideal ones.
-    """
-    problem = prepared.problem
-    null = problem.fit_effects(prepared.parameters, ())
-    law = find_law(problem, [null], problem.noise)
-    if (law is not None and law.is_sufficient) or not sensors_disagree(problem, null):
-        return problem, null, law
-    imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
-    own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
-    floor = imperfect.problem.noise
-    imperfect, own_null, own = find_law_beside_nuisances(prepared, imperfect, [own_null], floor)
-    return (problem, null, law) if own is None else (imperfect.problem, own_null, own)
 
 
 def find_law_beside_nuisances(

@@ -88,27 +88,23 @@ def _list_problems(
             yield place, features, force  # type: ignore[misc]
 
 
-def evolve_expressions(
-    features: Sequence[Float1D], target: Float1D, max_length: int = MAX_LENGTH
-) -> list[ast.expr]:
+def evolve_expressions(features: Sequence[Float1D], target: Float1D) -> list[ast.expr]:
     """Return the expressions of the front of error and length, their features X1, X2 and so on.
 
     Without the offset and the scale that are fitted around them. The same for the same data.
     """
-    regressor = fit_regressor(features, target / max(float(target.std()), 1e-300), max_length)
+    regressor = fit_regressor(features, target / max(float(target.std()), 1e-300))
     texts = [regressor.get_model_string(entry["tree"], 8) for entry in regressor.pareto_front_]
     return [_strip_scale(ast.parse(text.replace("^", "**"), mode="eval").body) for text in texts]
 
 
-def fit_regressor(
-    features: Sequence[Float1D], target: Float1D, max_length: int = MAX_LENGTH
-) -> Any:
+def fit_regressor(features: Sequence[Float1D], target: Float1D) -> Any:
     """Return pyoperon's regressor, fitted to `MAX_SAMPLES` of the samples at most."""
     from pyoperon.sklearn import SymbolicRegressor
 
     kept = np.linspace(0, target.size - 1, min(target.size, MAX_SAMPLES)).astype(np.int64)
     regressor = SymbolicRegressor(
-        allowed_symbols=SYMBOLS, max_length=max_length, population_size=POPULATION,
+        allowed_symbols=SYMBOLS, max_length=MAX_LENGTH, population_size=POPULATION,
         pool_size=POPULATION, generations=GENERATIONS, optimizer_iterations=5, n_threads=1,
         objectives=["r2", "length"], epsilon=1e-4, random_state=1,
     )  # fmt: skip

@@ -33,7 +33,7 @@ KIND_COLOURS = {
 # Towards white, or towards black where negative: of the attractors of one kind in a map.
 SHADES = (0.0, 0.55, -0.45, 0.82, -0.75)
 CHAOS_COLOUR = KIND_COLOURS["chaotic"]
-UP_COLOUR, DOWN_COLOUR, SCAN_COLOUR = "#d8434a", "#3f7fce", "#8a8a8a"
+UP_COLOUR, DOWN_COLOUR = "#d8434a", "#3f7fce"
 MAX_DRAWN_POINTS = 400  # points of a motion without period at one value of a diagram
 
 
@@ -172,15 +172,12 @@ def draw_section(points: Float2D, title: str) -> CaptionedFigure:
 def draw_bifurcation_diagram(
     up: BifurcationDiagram,
     down: BifurcationDiagram,
-    scan: BifurcationDiagram | None = None,
     bands: Sequence[ChaosRange] = (),
 ) -> CaptionedFigure:
     """Draw u at phase 0 and the largest exponent over a parameter, with the chaotic bands."""
     figure = Figure(figsize=(10, 6.2))
     section, exponents = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1))
     layers = [(up, UP_COLOUR, "increasing", 1.5), (down, DOWN_COLOUR, "decreasing", 0.9)]
-    if scan is not None:
-        layers.insert(0, (scan, SCAN_COLOUR, "from many starts", 2.4))
     for diagram, colour, _, size in layers:
         for is_periodic, factor in ((False, 1.0), (True, 2.2)):
             x, u = _collect_points(diagram, is_periodic)

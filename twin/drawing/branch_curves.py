@@ -24,9 +24,6 @@ class Axis:
     label: str
     factor: float = 1.0
 
-    def to_display(self, value: float) -> float:
-        return value * self.factor
-
 
 def make_axis(parameter: str) -> Axis:
     """Return the axis of a parameter: Hz, total gap in mm, level in g; SI for all others."""

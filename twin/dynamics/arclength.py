@@ -16,6 +16,7 @@ from scipy.linalg.lapack import dgesv
 from table_io.block import Float1D, Float2D
 
 MAX_ITERATIONS = 8
+SOLVE_TOL = 1e-9  # weighted last Newton step of a square system
 STEP_TOL = 1e-7  # weighted last Newton step; its square is a rounding error
 MIN_STEP = 1e-7  # weighted length below which a step is not halved again
 MAX_TURN_COS = 0.94  # cosine of the largest angle between the tangents of neighbors
@@ -120,7 +121,7 @@ def _determinant_sign(diagonal: list[float], pivots: list[int]) -> float:
 
 
 def solve_square(
-    evaluate: Callable[[Float1D], L], guess: Float1D, weights: Float1D, tolerance: float = 1e-9
+    evaluate: Callable[[Float1D], L], guess: Float1D, weights: Float1D
 ) -> tuple[Float1D, L]:
     """Return (z, linearization there) with F(z) = 0 for a square F; raises NoConvergence."""
     z, residual = guess, math.inf
@@ -133,7 +134,7 @@ def solve_square(
         if info or not np.isfinite(step).all():
             break
         z = z - step
-        if weighted_length(step, weights) < tolerance:
+        if weighted_length(step, weights) < SOLVE_TOL:
             return z, linearization
     raise NoConvergence(residual)
 

@@ -53,7 +53,7 @@ from twin.dynamics.orbits import (
 )
 
 EndReason = Literal[
-    "start", "range end", "closed loop", "meets another branch", "no convergence", "inadmissible",
+    "start", "range end", "closed loop", "meets another branch", "no convergence",
     "too many points",
 ]  # fmt: skip
 Point = CurvePoint[Evaluation]
@@ -211,14 +211,11 @@ def continue_branch(
     direction: int = 0,
     *,
     max_points: int = MAX_POINTS,
-    max_step: float = MAX_STEP,
-    check_admissibility: bool = False,
 ) -> Branch:
     """Follow the branch of an orbit over a parameter within limits; InputError outside of them.
 
     parameter: "frequency" in Hz, "level" in m/s2, "gap" (total) in m or a name of `Model.flatten`.
     direction: +1 starts towards larger values, -1 towards smaller ones; 0 follows both ways.
-    max_step: weighted, in tenths of the range and sizes of the orbit.
     """
     problem = make_problem(start, parameter)
     value = float(problem.start()[0])
@@ -231,7 +228,7 @@ def continue_branch(
         )
 
     def trace(sign: int) -> _Trace:
-        tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
+        tracer = _Trace(problem, limits, max_points)
         return tracer.follow(np.append(start.x, value), unit_axis(start.x.size + 1, sign))
 
     if direction:
@@ -249,8 +246,6 @@ def switch_branch(
     *,
     side: int = 1,
     max_points: int = MAX_POINTS,
-    max_step: float = MAX_STEP,
-    check_admissibility: bool = False,
 ) -> Branch:
     """Follow the branch that leaves at a period doubling or pitchfork, InputError elsewhere.
 
@@ -269,7 +264,7 @@ def switch_branch(
     values, vectors = np.linalg.eig(orbit.jacobian)
     vector = vectors[:, np.abs(values - (-1.0 if doubles else 1.0)).argmin()].real
     problem = OrbitProblem(orbit.period_map, orbit.periods * (2 if doubles else 1), parameter)
-    tracer = _Trace(problem, limits, max_points, max_step, check_admissibility)
+    tracer = _Trace(problem, limits, max_points)
     start = np.append(orbit.x, problem.start())
     return tracer.follow(start, side * np.append(vector, 0.0), leaves=True).branch(parameter)
 
@@ -282,12 +277,9 @@ class _Trace:
         problem: OrbitProblem,
         limits: tuple[float, float],
         max_points: int,
-        max_step: float,
-        check_admissibility: bool,
     ) -> None:
         self._problem, self._limits = problem, limits
-        self._max_points, self._max_step = max_points, max_step
-        self._check_admissibility = check_admissibility
+        self._max_points = max_points
         self._range = max(limits[1] - limits[0], 1e-12)
         self.points: list[BranchPoint] = []
         self.bifurcations: list[Bifurcation] = []
@@ -357,8 +349,6 @@ class _Trace:
     def _append(self, point: Point, multipliers: Complex1D | None = None) -> Orbit:
         orbit = self._problem.make_orbit(point.z, point.linearization.result, multipliers)
         self.points.append(BranchPoint(float(point.z[-1]), orbit))
-        if self._check_admissibility and not orbit.is_admissible():
-            self._finish("inadmissible", point.z[-1])
         return orbit
 
     def _reject(self, factor: float, error: NoConvergence | None = None) -> None:
@@ -416,7 +406,7 @@ class _Trace:
             return
         bends = turn_cos < MAX_TURN_COS
         self._curvature = np.zeros(guess.size) if bends else (new.tangent - tangent) / step
-        self._step = next_step(step, turn_cos, new.iterations, self._max_step)
+        self._step = next_step(step, turn_cos, new.iterations, MAX_STEP)
 
     def _correct(self, guess: Float1D, tangent: Float1D, weights: Float1D) -> Point:
         """Return the branch's point near a guess; where it bends, at the parameter's value there.

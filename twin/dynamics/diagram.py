@@ -80,18 +80,14 @@ class Diagram:
     isolas: tuple[Branch, ...]
     unfollowed: tuple[Bifurcation, ...]
 
-    def orbits_at(self, value: float, *, stable_only: bool = False) -> list[Orbit]:
+    def orbits_at(self, value: float) -> list[Orbit]:
         """Return the distinct orbits at a value of the parameter, one of each set of phases."""
         orbits: list[Orbit] = []
         for branch in self.branches:
             for orbit in branch.orbits_at(value):
-                if (orbit.stable or not stable_only) and not any(map(orbit.is_same, orbits)):
+                if not any(map(orbit.is_same, orbits)):
                     orbits.append(orbit)
         return orbits
-
-    def find_branch(self, orbit: Orbit) -> Branch | None:
-        """Return the branch on which an orbit lies, at any of its phases, or None."""
-        return next((b for b in self.branches if b.contains(orbit)), None)
 
 
 def compute_diagram(

@@ -68,7 +68,6 @@ def continue_locus(
     parameters: tuple[str, str] = (FREQUENCY, GAP),
     limits: tuple[Limits, Limits] = ((0.5, 5.0), (0.0, 0.03)),
     *,
-    max_points: int = MAX_POINTS,
     max_step: float = MAX_STEP,
 ) -> Locus:
     """Follow a fold, period doubling, Neimark-Sacker or grazing over two parameters, both ways.
@@ -92,10 +91,10 @@ def continue_locus(
                 value=float(value),
                 allowed=f"{low:.6g} to {high:.6g}",
             )
-    ahead = _follow(start, parameters, limits, 1, max_points, max_step)
+    ahead = _follow(start, parameters, limits, 1, max_step)
     if ahead[1].reason == "closed loop":
         return _make_locus(start, parameters, ahead[0], (ahead[1], ahead[1]))
-    before = _follow(start, parameters, limits, -1, max_points, max_step)
+    before = _follow(start, parameters, limits, -1, max_step)
     return _make_locus(start, parameters, [*before[0][:0:-1], *ahead[0]], (before[1], ahead[1]))
 
 
@@ -116,7 +115,6 @@ def _follow(
     parameters: tuple[str, str],
     limits: tuple[Limits, Limits],
     sign: int,
-    max_points: int,
     max_step: float,
 ) -> tuple[list[Point], LocusEnd]:
     """Return (points, why they end) of a locus that starts with the second parameter's `sign`."""
@@ -141,7 +139,7 @@ def _follow(
     except NoConvergence as error:
         return finish("no convergence", error.residual)
     key, step = contact_key(points[0].linearization.result.contacts), FIRST_STEP
-    while len(points) < max_points:
+    while len(points) < MAX_POINTS:
         last = points[-1]
         guess = _predict(points, step)
         try:

@@ -13,12 +13,11 @@ A model file names it (`file = "softening_spring.toml"` in its [[effects]] entry
 [effects.law]). The expressions follow the grammar of `expression`; units are checked.
 """
 
-from functools import lru_cache
 from typing import Literal
 
 from pydantic import Field, model_validator
 
-from table_io.config.base import ConfigModel, Finite, parse_toml
+from table_io.config.base import ConfigModel, Finite
 from table_io.config.toml_text import format_toml
 from twin.laws.checks import ID_PATTERN
 from twin.laws.effect import Effect, EffectParameter, State
@@ -97,12 +96,6 @@ class EffectFile(ConfigModel):
             citation=self.citation,
             is_of_file=True,
         )
-
-
-@lru_cache(maxsize=256)
-def read_effect(text: str) -> Effect:
-    """Return the effect of an effect file's text; InputError says what is wrong with it."""
-    return parse_toml(text, EffectFile, "effect file").build_effect()
 
 
 def format_effect_file(effect: Effect) -> str:

@@ -52,7 +52,6 @@ PULL_WIDTH = 0.1  # of the pull-off force: over which an adhesive contact lets g
 MAX_RELAXATIONS, MAX_FACE_RELAXATIONS = 50.0, 5.0  # of a state and of a free face in a sample
 MAX_STATE_RELAXATIONS = 0.5  # relaxation times of an added law per step of its integration
 STILL_FACE_M = 1e-9  # a face that would move less in a sample stays: it has relaxed
-FORCE_ROWS = ("damper", "right", "left")
 # One signature: numba never caches a kernel specialized to the function of an effect.
 _READ = types.Array(float64, 1, "A", readonly=True)
 _KERNELS = [

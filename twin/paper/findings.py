@@ -29,6 +29,7 @@ MIN_GAP_MM, GAP_TOLERANCE_MM = (
 )  # limit and tolerance of the search for permanent contact
 MAX_HYSTERESIS_HZ = 2.0  # from a frequency within a hysteresis to its end
 BRANCH_MARGIN_HZ = 0.5  # by which a branch is followed beyond a hysteresis
+MIN_BAND_VALUE = 0.05  # of an exponent or a share in a band of a curve
 SETTLE_CYCLES = 400  # cycles until the motion is steady
 FLIGHT_CYCLES = 4  # cycles over which the share of flight is measured
 
@@ -315,10 +316,10 @@ def compute_lyapunov_exponent(
     return case.simulator.lyapunov_exponent(frequency_hz, a, state, cycle_count)[0]
 
 
-def find_bands(frequency: Float1D, values: Float1D, threshold: float = 0.05) -> list[list[float]]:
-    """Return [from, to] in Hz of each run of grid frequencies with values above `threshold`."""
+def find_bands(frequency: Float1D, values: Float1D) -> list[list[float]]:
+    """Return [from, to] in Hz of each run of the grid with values above `MIN_BAND_VALUE`."""
     intervals: list[list[float]] = []
-    for index in np.flatnonzero(values > threshold):
+    for index in np.flatnonzero(values > MIN_BAND_VALUE):
         frequency_hz = float(frequency[index])
         if intervals and index and intervals[-1][1] == float(frequency[index - 1]):
             intervals[-1][1] = frequency_hz

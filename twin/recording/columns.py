@@ -129,14 +129,6 @@ class StoredItems(Sequence[Item]):
         )
         self._contiguous: dict[str, tuple[Block, ...]] = {}
 
-    @classmethod
-    def from_items(cls, items: Iterable[Item]) -> "StoredItems":
-        """Store items in columns of their own."""
-        items = list(items)
-        count = sum(len(item) for item in items if isinstance(item, Block))
-        store = BlockStore(lambda _: count)
-        return cls(store.add(item) if isinstance(item, Block) else item for item in items)
-
     def __len__(self) -> int:
         return len(self.entries)
 

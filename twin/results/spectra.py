@@ -67,11 +67,6 @@ class ShockSpectrum:
     positive_m_s2: Float1D
     negative_m_s2: Float1D
 
-    @property
-    def maximax_m_s2(self) -> Float1D:
-        """Largest magnitude at any time, (frequency,)."""
-        return np.maximum(self.positive_m_s2, self.negative_m_s2)
-
 
 class OscillatorSteps(NamedTuple):
     """How oscillators advance by a substep: coefficients (frequency, 2, 4), counts (frequency,).

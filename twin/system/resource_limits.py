@@ -34,7 +34,7 @@ def require_memory(min_bytes: int) -> None:
         )
 
 
-def require_open_files(min_files: int = MIN_OPEN_FILES) -> None:
+def require_open_files() -> None:
     """Raise the limit on open files to `WANTED_OPEN_FILES`; InputError if it stays below this.
 
     Child processes inherit it.
@@ -48,12 +48,12 @@ def require_open_files(min_files: int = MIN_OPEN_FILES) -> None:
         is_limited = highest != resource.RLIM_INFINITY
         limit = min(WANTED_OPEN_FILES, highest) if is_limited else WANTED_OPEN_FILES
         resource.setrlimit(resource.RLIMIT_NOFILE, (limit, highest))
-    if limit < min_files:
+    if limit < MIN_OPEN_FILES:
         raise InputError(
             "the limit on open files is too low",
             where="this shell",
             key="ulimit -n",
             value=limit,
-            allowed=f"at least {min_files}",
+            allowed=f"at least {MIN_OPEN_FILES}",
             remedy=f"raise it with `ulimit -n {WANTED_OPEN_FILES}`, or in the service or batch job",
         )

@@ -14,7 +14,6 @@ from rich.table import Table
 
 from table_io.errors import replace_escapes
 
-DECAY_MESSAGE = "stopping: the table decays to rest"
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")  # Ctrl-C, kill, a closed window, Ctrl-\\
 ANNOUNCE_AFTER_S = 1.5  # longer than loading from a cache
 FILE_COLUMNS = 400  # of output to a file or pipe, where lines need no wrapping

@@ -2,15 +2,10 @@
 
 import socket
 
-from table_io.errors import InputError, require_package
+from table_io.errors import InputError
 
 VIEW_ADDRESS = "127.0.0.1:9876"
 MAX_PORTS = 100
-
-
-def require_rerun(where: str) -> None:
-    """Raise InputError with the pip line if Rerun is not installed, which only views need."""
-    require_package("rerun", "view", where)
 
 
 def parse_address(address: str) -> tuple[str, int]:

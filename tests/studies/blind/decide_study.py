@@ -16,14 +16,20 @@ import numpy as np
 
 from table_io.clock import cpu_seconds
 from table_io.errors import InputError
+from table_io.records import RunStart
 from tests.studies.blind.cases import draw_case
 from tests.studies.blind.harness import RESULTS_FILE, Study, StudyOptions, read_rows, run_study
 from tests.studies.blind.metrics import Rate, select_latest
 from tests.studies.blind.plant import CasePaths, SealedPlant, find_shares, make_truth
 from tests.studies.blind.rig import MODEL_TOML, PROFILE_TOML
 from twin.discovery.decisive_test import (
+    BAND_RATIO,
+    LEVEL_RATIOS,
     CandidateTest,
-    draw_random_test,
+    _build_tests,
+    _make_sweep,
+    _measure_test,
+    _read_profile,
     list_candidate_tests,
     propose_tests,
 )
@@ -39,6 +45,7 @@ Json = dict[str, Any]
 DEFAULT_CELLS = ("pair/*/1%", "pair/*/5%")
 TABLE_FILE = "decisive_runs.md"
 MAX_TEST_MIN = 10.0
+MAX_DRAWS = 1000  # of a random test
 STUDY_SWEEP = PROFILE_TOML[PROFILE_TOML.index("start_hz") : PROFILE_TOML.index("[acquisition]")]
 POOR_SWEEP = """\
 start_hz = 2.0
@@ -166,6 +173,27 @@ class _DecidedPlant:
             "confidence": verdict.confidence, "decided": verdict.is_decided or has_law,
             "right": is_right,
         }  # fmt: skip
+
+
+def draw_random_test(
+    recorded: RunStart, rig_toml: str, minutes: float, generator: np.random.Generator
+) -> CandidateTest:
+    """Draw a stepped sine within the limits of the rig, of about this duration in min.
+
+    Ends of its band and its level are log-uniform over the range of the candidate tests.
+    """
+    profile, kept = _read_profile(recorded)
+    low_hz, high_hz, level_g = _measure_test(profile)
+    limits_hz = np.log([low_hz / BAND_RATIO, high_hz * BAND_RATIO])
+    limits_g = np.log([level_g * min(LEVEL_RATIOS), level_g * max(LEVEL_RATIOS)])
+    for _ in range(MAX_DRAWS):
+        ends_hz = np.sort(np.exp(generator.uniform(limits_hz[0], limits_hz[1], size=2)))
+        level = float(np.exp(generator.uniform(limits_g[0], limits_g[1])))
+        sweep = _make_sweep((float(ends_hz[0]), float(ends_hz[1])), level, duration_s=60 * minutes)
+        content = kept | {"title": "random test", "excitation": sweep}
+        if tests := _build_tests(content, recorded, rig_toml):
+            return tests[0]
+    raise InputError("the rig can play no random test", where=f"recording {recorded.run}")
 
 
 def format_decision(row: Json) -> str:

@@ -33,12 +33,17 @@ from tests.studies.blind.plant import SealedPlant, describe_end, generate_case
 from tests.studies.blind.rig import MODEL_TOML, PROFILE, PROFILE_TOML, StudySignals
 from tests.studies.blind.rivals import describe_missing, find_rivals, load_case
 from tests.studies.blind.scoring import select_case_facts
-from twin.discovery.discover import prepare_problem
-from twin.discovery.law_search import LawProposal, find_law_of_base
+from twin.discovery.discover import (
+    PreparedProblem,
+    add_nuisances,
+    prepare_problem,
+    sensors_disagree,
+)
+from twin.discovery.law_search import LawProposal, find_law, find_law_beside_nuisances
 from twin.discovery.law_terms import LAW_PREFIX
 from twin.discovery.localization import estimate_repeatability_floor
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
-from twin.discovery.selection import FittedSet
+from twin.discovery.selection import FittedSet, SelectionProblem
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import Model
 from twin.model.prepare import prepare_solver
@@ -153,6 +158,25 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
                 "failed": failure,
             }
     return row
+
+
+def find_law_of_base(
+    prepared: PreparedProblem,
+) -> tuple[SelectionProblem, FittedSet, LawProposal | None]:
+    """Return (problem, its base, law) without a search of the library before.
+
+    With nuisances where sensors disagree and no law suffices with ideal ones.
+    """
+    problem = prepared.problem
+    null = problem.fit_effects(prepared.parameters, ())
+    law = find_law(problem, [null], problem.noise)
+    if (law is not None and law.is_sufficient) or not sensors_disagree(problem, null):
+        return problem, null, law
+    imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
+    own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
+    floor = imperfect.problem.noise
+    imperfect, own_null, own = find_law_beside_nuisances(prepared, imperfect, [own_null], floor)
+    return (problem, null, law) if own is None else (imperfect.problem, own_null, own)
 
 
 def _describe_terms(law: LawProposal | None) -> list[Json]:

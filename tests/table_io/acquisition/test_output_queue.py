@@ -10,10 +10,10 @@ from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
 from table_io.acquisition.session import SessionSetup, run_session
 from table_io.block import Float1D, Float2D, Label, join_blocks
 from table_io.clock import ManualClock
-from table_io.config.calibration import command_to_si
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep
 from table_io.records import Event, FrequencyResponse
+from tests.builders.rigs import command_to_si
 from tests.builders.sessions import make_start
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,

@@ -11,7 +11,6 @@ import pytest
 from table_io.acquisition.session import LatenessLog, OperatorCommand, SessionSetup, run_session
 from table_io.block import Block, Float1D, Float2D, Label, join_blocks
 from table_io.clock import ManualClock
-from table_io.config.calibration import command_to_si, si_to_volts
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive
@@ -20,7 +19,7 @@ from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
-from tests.builders.rigs import RIG
+from tests.builders.rigs import RIG, command_to_si, si_to_volts
 from tests.builders.sessions import make_start
 
 RATE_HZ = 2000.0

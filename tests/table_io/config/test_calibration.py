@@ -8,16 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from table_io.config.calibration import (
-    command_to_si,
     command_to_volts,
     compute_tare,
     measure_noise,
-    si_to_volts,
     volts_to_si,
 )
 from table_io.config.rig import OutputConfig
 from table_io.config.sensor import SensorConfig
-from tests.builders.rigs import RIG
+from tests.builders.rigs import RIG, command_to_si, si_to_volts
 
 REVERSED = SensorConfig(channel="force_l1_n", unit="kN", range=10.0, volts_per_unit=-0.5, bits=16)
 

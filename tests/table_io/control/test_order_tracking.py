@@ -8,7 +8,6 @@ import pytest
 from table_io.block import Float1D
 from table_io.control.order_tracking import (
     HARMONIC_COUNT,
-    HarmonicFit,
     evaluate_gain,
     evaluate_transfer,
     track_channels,
@@ -84,12 +83,6 @@ def test_lost_sample_leaves_no_order_with_a_number(lost: float) -> None:
     assert fit.amplitudes.size == HARMONIC_COUNT
     assert np.isnan(fit.amplitudes).all()
     assert np.isnan([fit.offset, fit.residual_rms]).all()
-
-
-def test_distortion_is_the_rss_of_the_overtones_over_the_fundamental() -> None:
-    fit = HarmonicFit(5.0, np.array([3j, -0.4, 0.3j, 1.2]), 7.0)
-    assert fit.fundamental == 3.0
-    assert fit.distortion == pytest.approx(1.3 / 3.0, rel=1e-12)
 
 
 # The response between and beyond its points

@@ -16,6 +16,7 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.hydraulic_table import BRISTLE, SPOOL, HydraulicCoefficients, P
 from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
+from tests.builders.rigs import compute_oil_column_hz
 
 RATE_HZ = 1000.0
 RIG = load_config(PROFILES_DIR / "rigs" / "hydraulic.toml", RigConfig, "rig")[0]
@@ -149,7 +150,7 @@ def test_shut_valve_leaves_the_mass_on_the_oil_column() -> None:
     crossings = np.flatnonzero(np.diff(np.signbit(y - y[-1])))
     hz = (crossings.size - 1) / 2.0 / ((crossings[-1] - crossings[0]) / RATE_HZ)
     assert CONFIG.hydraulic is not None
-    assert hz == pytest.approx(CONFIG.hydraulic.oil_column_hz(MASS_KG), rel=0.01)
+    assert hz == pytest.approx(compute_oil_column_hz(CONFIG.hydraulic, MASS_KG), rel=0.01)
     assert hz == pytest.approx(27.0, abs=0.5)
 
 
