@@ -1,6 +1,5 @@
 """Task: follow the periodic motions of a model, stable and unstable, over a parameter."""
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,7 +19,7 @@ from twin.model.model import Model
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import RunConfig, make_run_id, read_run_config
 from twin.setup.warm_up import COMPILING_MESSAGE
-from twin.system.files import count_cores
+from twin.system.process_pool import map_in_threads
 from twin.system.progress import OpenStage, open_silently
 
 MAP_VALUES = 41  # of the second parameter, spread evenly over its range
@@ -95,9 +94,9 @@ def follow_branches(
     attractors = None
     if options.attractors or options.basins_hz is not None:
         period_map = make_period_map(model, frequency_hz, level)
-        with open_stage(ATTRACTOR_MESSAGE), ThreadPoolExecutor(count_cores()) as pool:
+        with open_stage(ATTRACTOR_MESSAGE):
             attractors = study_attractors(
-                period_map, options.over, limits, options.basins_hz, pool.map
+                period_map, options.over, limits, options.basins_hz, map_in_threads
             )
         bands = tuple((band.low, band.high) for band in attractors.bands)
         branches = replace(branches, chaotic=bands)

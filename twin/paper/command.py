@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
 from twin.paper.page import (
     PAPER_MODEL,
     ModelSource,
@@ -11,13 +9,14 @@ from twin.paper.page import (
     write_paper_json,
     write_paper_page,
 )
-from twin.paper.study import JOB_COUNT, PaperStudy, run_paper_study
+from twin.paper.study import JOB_COUNT, run_paper_study
 from twin.paper.table import DEPARTS, make_comparison_table
 from twin.results.measured_campaign import MeasuredCampaign, load_measured_campaign
 from twin.results.paper_cases import load_paper_cases
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import make_run_id, read_model
 from twin.setup.warm_up import COMPILING_MESSAGE
+from twin.system.progress import make_task_bar
 from twin.system.terminal import announce_if_slow, console, print_line
 
 
@@ -36,7 +35,10 @@ def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: Mo
     print_line(
         f"model {source.name}, {source.config.title}: every test of the paper, forward and backward"
     )
-    study = _run_with_progress(source, campaign)
+    with make_task_bar() as bar:
+        task = bar.add_task("sweeps", total=JOB_COUNT)
+        scale = campaign.scale if campaign else None
+        study = run_paper_study(source.reference, scale, lambda: bar.advance(task))
     rows = make_comparison_table(study)
     figure_sets = [("The model", draw_paper_figures(study, None, folder / "figures", print_line))]
     if campaign is not None:
@@ -58,17 +60,3 @@ def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: Mo
     print_line(
         f"{source.name}: {len(rows)} statements, {departures} depart -> {folder / 'report.html'}"
     )
-
-
-def _run_with_progress(source: ModelSource, campaign: MeasuredCampaign | None) -> PaperStudy:
-    """Run the study with a progress bar on a terminal (about 1 min for an integrated model)."""
-    progress = Progress(
-        TextColumn("[bold]{task.description}"), BarColumn(bar_width=40),
-        TextColumn("{task.percentage:3.0f} %"), TimeRemainingColumn(),
-        console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
-    with progress:
-        task = progress.add_task("sweeps", total=JOB_COUNT)
-        return run_paper_study(
-            source.reference, campaign.scale if campaign else None, lambda: progress.advance(task)
-        )

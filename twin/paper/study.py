@@ -1,7 +1,6 @@
 """Paper study: every simulation that figures and table need, computed once."""
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -13,9 +12,10 @@ from twin.paper.findings import Folds, ImpactDistribution
 from twin.paper.low_frequency import ChaosMeasure, SecondaryResonances
 from twin.paper.slow_passage import SlowSweep, run_slow_sweep
 from twin.results.paper_cases import PaperCase, load_paper_cases
-from twin.system.files import count_cores
+from twin.system.process_pool import map_in_threads
 
 T = TypeVar("T")
+V = TypeVar("V")
 SECONDARY_HZ = (0.53, 0.71, 1.1)  # f1, f2, f3 of the paper
 IRREGULAR_HZ, COEXISTING_HZ = 1.4, 3.4
 DETAIL_HZ = (*SECONDARY_HZ, IRREGULAR_HZ, COEXISTING_HZ)
@@ -63,31 +63,22 @@ def run_paper_study(
     cases = load_paper_cases(model, scale)
     names, g4 = list(cases), cases["G4"]
 
-    def run_parallel(compute: Callable[..., T], *argument_lists: Sequence[object]) -> list[T]:
-        """Map `compute` over the lists on threads; the kernels release the GIL."""
+    def run_parallel(compute: Callable[[V], T], values: Sequence[V]) -> list[T]:
+        return map_in_threads(compute, values, on_done)
 
-        def run_job(*arguments: object) -> T:
-            result = compute(*arguments)
-            on_done()
-            return result
-
-        return list(pool.map(run_job, *argument_lists))
-
-    with ThreadPoolExecutor(count_cores()) as pool:
-        slow_sweeps = dict(
-            zip(names, run_parallel(run_slow_sweep, list(cases.values())), strict=True)
-        )
-        gaps = [name for name in names if name != "G∞"]
-        folds = run_parallel(lambda name: findings.find_folds(cases[name], slow_sweeps[name]), gaps)
-        frequencies = (*SECONDARY_HZ, IRREGULAR_HZ)
-        impacts = run_parallel(lambda hz: findings.compute_impact_distribution(g4, hz), frequencies)
-        chaos = run_parallel(lambda hz: low_frequency.measure_chaos(g4, hz), frequencies)
-        secondary = run_parallel(
-            lambda name: low_frequency.find_secondary_resonances(cases[name]), POSITIVE_GAPS
-        )
-        exponents = run_parallel(
-            lambda hz: findings.compute_lyapunov_exponent(g4, hz, 400), CHAOS_SCAN_HZ.tolist()
-        )
+    sweeps = run_parallel(run_slow_sweep, list(cases.values()))
+    slow_sweeps = dict(zip(names, sweeps, strict=True))
+    gaps = [name for name in names if name != "G∞"]
+    folds = run_parallel(lambda name: findings.find_folds(cases[name], slow_sweeps[name]), gaps)
+    frequencies = (*SECONDARY_HZ, IRREGULAR_HZ)
+    impacts = run_parallel(lambda hz: findings.compute_impact_distribution(g4, hz), frequencies)
+    chaos = run_parallel(lambda hz: low_frequency.measure_chaos(g4, hz), frequencies)
+    secondary = run_parallel(
+        lambda name: low_frequency.find_secondary_resonances(cases[name]), POSITIVE_GAPS
+    )
+    exponents = run_parallel(
+        lambda hz: findings.compute_lyapunov_exponent(g4, hz, 400), CHAOS_SCAN_HZ.tolist()
+    )
     return PaperStudy(
         cases, slow_sweeps, dict(zip(gaps, folds, strict=True)),
         dict(zip(frequencies, impacts, strict=True)), np.array(exponents),

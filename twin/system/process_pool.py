@@ -23,7 +23,7 @@ from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from typing import Any
+from typing import Any, TypeVar
 
 from table_io.clock import RealClock
 from table_io.errors import InputError, require_package
@@ -41,6 +41,8 @@ LOST_MESSAGE = "the Dask scheduler no longer answers; what is completed is kept"
 RESUME_REMEDY = "start scheduler and workers again, and resume"
 Task = Callable[[int], Any]
 StopFunction = Callable[[], object]
+Value = TypeVar("Value")
+Result = TypeVar("Result")
 
 
 def find_no_problem() -> str:
@@ -134,6 +136,24 @@ def order_results(results: Iterable[TaskResult]) -> Iterator[TaskResult]:
         while following in completed:
             yield completed.pop(following)
             following += 1
+
+
+def map_in_threads(
+    compute: Callable[[Value], Result],
+    values: Iterable[Value],
+    on_done: Callable[[], object] = lambda: None,
+) -> list[Result]:
+    """Return what `compute` returns for each value, in order, on one thread per core.
+
+    For kernels that release the GIL. `on_done` is called after each value.
+    """
+    arguments = list(values)
+    results: dict[int, Result] = {}
+    workers = Workers(count_cores(), in_threads=True)
+    for result in run_tasks(lambda n: compute(arguments[n]), range(len(arguments)), workers):
+        results[result.number] = result.value
+        on_done()
+    return [results[number] for number in range(len(arguments))]
 
 
 def _run_in_threads(
