@@ -2,9 +2,10 @@
 
 import ast
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -30,6 +31,8 @@ TASKS = {
     "identify": ("identify",),
     "import": ("import_table",),
     "map": ("compute_map",),
+    "replay": ("replay",),
+    "simulate": ("simulate",),
     "table-drive": ("compute_drive",),
     "table-twin": ("identify_table",),
     "verify": ("verify", "repair_log"),
@@ -146,6 +149,27 @@ def compare_sweeps(log: Path, folder: Path) -> tuple[object, object]:
     return (cases, tables[0]), (written["cases"], tables[1])
 
 
+def compare_replays(log: Path, folder: Path) -> tuple[object, object]:
+    assert call_main("replay", log, "--steps", "0:2", "--out", folder / "shell").returncode == 0
+    replayed = api.replay(log, folder / "python", steps="0:2")
+    written = api.open_log(folder / "shell").summary.to_plain()
+    assert replayed.result.to_plain() == written["replay"]
+    return drop_run(replayed.summary.to_plain()), drop_run(written)
+
+
+def drop_run(summary: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a summary without the name and date of its run."""
+    return {**summary, "run": None}
+
+
+def compare_simulations(log: Path, folder: Path) -> tuple[object, object]:
+    (folder / "test.toml").write_text(api.open_log(log).start.profile_toml)
+    assert call_main("simulate", folder / "test.toml", "--out", folder / "shell").returncode == 0
+    simulated = api.simulate(folder / "test.toml", folder / "python")
+    written = api.open_log(folder / "shell").summary.to_plain()
+    return drop_run(simulated.summary.to_plain()), drop_run(written)
+
+
 def compare_repairs(log: Path, folder: Path) -> tuple[object, object]:
     (folder / "cut.mcap").write_bytes(log.read_bytes()[:-20_000])
     words = ("--repair", folder / "shell.mcap")
@@ -182,6 +206,8 @@ def compare_wirings(log: Path, folder: Path) -> tuple[object, object]:
         compare_plans,
         compare_repairs,
         compare_sweeps,
+        compare_replays,
+        compare_simulations,
         compare_verifications,
         compare_wirings,
     ],

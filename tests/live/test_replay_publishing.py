@@ -12,7 +12,7 @@ import pytest
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
 from tests.builders.ports import free_endpoint
-from tests.input_errors import raises_input_error
+from tests.command_line import call_main
 from twin.live import replay_publishing
 from twin.recording.recovery import recover_log
 from twin.replay.command import ReplayRequest, replay_logs
@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def endpoint(monkeypatch: pytest.MonkeyPatch) -> str:
     """A free one; and no report is drawn."""
-    monkeypatch.setattr("twin.replay.command.finalize_run", lambda *_: 0)
+    monkeypatch.setattr("twin.report.report.write_report", lambda *_: None)
     return free_endpoint()
 
 
@@ -120,10 +120,11 @@ def test_replay_at_a_used_endpoint_is_refused(
 ) -> None:
     hub = open_hub("simulated", endpoint)
     try:
-        with raises_input_error(
-            key="endpoint", value=endpoint, problem=os.strerror(errno.EADDRINUSE)
-        ):
-            replay_logs(ReplayRequest([log_file], [], tmp_path / "out", publish=endpoint))
+        words = ("--publish", "--listen", endpoint, "--out", tmp_path / "out")
+        result = call_main("replay", log_file, *words)
     finally:
         hub.close()
+    assert result.returncode == 2
+    assert endpoint in result.stderr
+    assert os.strerror(errno.EADDRINUSE) in result.stderr
     assert not (tmp_path / "out").exists()

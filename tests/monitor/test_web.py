@@ -8,7 +8,7 @@ import ssl
 import subprocess
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,7 @@ def test_the_page_of_a_run_is_a_process_that_ends_with_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     port = free_port()
-    with start_page_process(f"127.0.0.1:{port}", free_endpoint(), "simulated", None):
+    with start_page_process(f"127.0.0.1:{port}", free_endpoint(), None, "simulated"):
         assert f"page: http://127.0.0.1:{port}/" in capsys.readouterr().out
         connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
         connection.request("GET", "/")
@@ -104,7 +104,7 @@ def test_foreign_server_is_not_announced_as_the_page(
 ) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other, raises_input_error(key="--web"):
         address = f"127.0.0.1:{other.getsockname()[1]}"
-        with start_page_process(address, free_endpoint(), "simulated", None):
+        with start_page_process(address, free_endpoint(), None, "simulated"):
             pass
     assert "page:" not in capsys.readouterr().out
 
@@ -116,7 +116,7 @@ def test_the_page_of_a_run_reaches_a_gateway_on_all_interfaces(
     lab, port, place = laboratory(tmp_path / "lab"), free_port(), f"tls/{host}:{free_port()}"
     keys, code = read_credentials(lab), new_code(lab, "anna", capsys)
     headers = {"Content-Type": "application/json", "Origin": f"https://127.0.0.1:{port}"}
-    with door(place, keys=keys), start_page_process(f"127.0.0.1:{port}", place, RIG, keys):
+    with door(place, keys=keys), start_page_process(f"127.0.0.1:{port}", place, keys, RIG):
         tls = ssl.create_default_context(cafile=str(lab / "ca.pem"))
         connection = http.client.HTTPSConnection("127.0.0.1", port, context=tls)
         body = json.dumps({"command": "hold", "run": RUN})
@@ -135,7 +135,7 @@ def test_a_page_that_hangs_does_not_keep_the_run(monkeypatch: pytest.MonkeyPatch
     popen = subprocess.Popen
     monkeypatch.setattr(subprocess, "Popen", note_process)
     monkeypatch.setattr(web, "END_TIMEOUT_S", 0.5)
-    with start_page_process(f"127.0.0.1:{free_port()}", free_endpoint(), "simulated", None):
+    with start_page_process(f"127.0.0.1:{free_port()}", free_endpoint(), None, "simulated"):
         processes[0].send_signal(signal.SIGSTOP)
         rescue = threading.Timer(PATIENCE_S, processes[0].kill)
         rescue.start()
@@ -146,7 +146,16 @@ def test_a_page_that_hangs_does_not_keep_the_run(monkeypatch: pytest.MonkeyPatch
 
 def test_a_page_goes_with_a_test_in_real_time_only() -> None:
     with raises_input_error(key="--web"):
-        run_test(Path("quickstart"), None, True, None, None, False, "", web="")
+        run_test(
+            Path("quickstart"),
+            None,
+            True,
+            None,
+            None,
+            False,
+            "",
+            start_page=lambda _: nullcontext(),
+        )
 
 
 @pytest.mark.parametrize("option", ["--once", "--picture=now.svg"])

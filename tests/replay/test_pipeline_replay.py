@@ -31,7 +31,9 @@ from twin.recording.reader import Recording, read_recording
 from twin.recording.tabular import parse_step_range
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
+from twin.replay.task import describe_replay
 from twin.report.finalize import EXIT_NOT_IDENTICAL
+from twin.results.contracts import ReplayResult
 from twin.setup.run_config import RunConfig
 from twin.transport.codec import Item, encode_item
 
@@ -265,11 +267,13 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the command has to say of a replay; no report is drawn."""
     kept: dict[str, Any] = {}
 
-    def close(folder: Path, bundle: RunConfig, view: bool, extra: dict[str, Any]) -> int:
-        kept.update(extra["replay"])
-        return 0
+    def describe(*given: Any) -> ReplayResult:
+        result = describe_replay(*given)
+        kept.update(result.to_plain())
+        return result
 
-    monkeypatch.setattr("twin.replay.command.finalize_run", close)
+    monkeypatch.setattr("twin.replay.task.describe_replay", describe)
+    monkeypatch.setattr("twin.report.report.write_report", lambda *_: None)
     return kept
 
 

@@ -13,8 +13,10 @@ from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
+from twin.replay.task import describe_replay
 from twin.replay.verify import ReplayOutlook, examine_logs, verify_logs
-from twin.report.finalize import EXIT_NOT_IDENTICAL
+from twin.report.finalize import EXIT_ABORTED, EXIT_NOT_IDENTICAL
+from twin.results.contracts import ReplayResult
 from twin.setup.run_config import RunConfig
 from twin.system.versions import read_installed_versions
 from twin.transport.codec import Item
@@ -51,11 +53,13 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """What the command has to say of a replay; no report is drawn."""
     kept: dict[str, Any] = {}
 
-    def close(folder: Path, bundle: RunConfig, view: bool, extra: dict[str, Any]) -> int:
-        kept.update(extra["replay"])
-        return 0
+    def describe(*given: Any) -> ReplayResult:
+        result = describe_replay(*given)
+        kept.update(result.to_plain())
+        return result
 
-    monkeypatch.setattr("twin.replay.command.finalize_run", close)
+    monkeypatch.setattr("twin.replay.task.describe_replay", describe)
+    monkeypatch.setattr("twin.report.report.write_report", lambda *_: None)
     return kept
 
 
@@ -128,7 +132,8 @@ def test_replay_without_recorded_comparisons_is_not_different(
 ) -> None:
     """Nor is it said that none are made."""
     log = without_comparisons(recording, tmp_path / "a.mcap", ended=ended)
-    assert replay_logs(ReplayRequest([log], [], tmp_path / "one")) == 0
+    code = replay_logs(ReplayRequest([log], [], tmp_path / "one"))
+    assert code == (0 if ended else EXIT_ABORTED)
     made = len(read_recording(tmp_path / "one" / "run.mcap").records(Comparison))
     assert made > 300
     output = " ".join(capsys.readouterr().out.split())

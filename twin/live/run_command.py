@@ -5,12 +5,14 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from table_io.clock import RealClock
-from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, finalize_run
+from twin.log import Log, open_log
+from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, print_outcome, write_results
 from twin.security.credentials import Credentials, credentials_folder
 from twin.setup.disk import require_disk_space
 from twin.setup.folders import RUNS_FOLDER, make_run_folder
 from twin.setup.realtime import check_full_speed, check_realtime
 from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 from twin.setup.warm_up import compile_kernels
 from twin.setup.warnings import list_test_warnings
 from twin.system.progress import RunProgress
@@ -62,15 +64,36 @@ def run_test(
                 began = _run_live(config, run_id, folder, poll_interrupt, view, *connection)
                 if not began:
                     return EXIT_INTERRUPTED
-        code = finalize_run(folder, config, view)
+        summary = write_results(folder, config, view)
+        code = print_outcome(summary, folder, len(config.steps))
     return EXIT_INTERRUPTED if poll_interrupt() and code == EXIT_ABORTED else code
+
+
+def run_simulated(
+    profile: str | Path,
+    out: str | Path | None = None,
+    model: str | Path | None = None,
+    table: str | Path | None = None,
+) -> Log:
+    """Run a test on a simulated table as fast as possible; return its log in folder `out`.
+
+    The table has sensors with noise, a servo, and what its rig file `table` hides; `model` is that
+    of the twin. Writes summary and report, as `run --speed max` does. InputError if the test
+    exceeds the limits of the table, or the table is real.
+    """
+    names = (None if name is None else str(name) for name in (table, model))
+    config = read_run_config(Path(profile), *names)
+    check_full_speed(config.rig)
+    compile_kernels(config, table=True)
+    folder, run = make_run_folder(None if out is None else Path(out), config.name)
+    play_unpaced(config, run, folder / "run.mcap", lambda: None, lambda _: None)
+    write_results(folder, config)
+    return open_log(folder)
 
 
 def _run_unpaced(
     config: RunConfig, run: str, folder: Path, poll_interrupt: Callable[[], str | None]
 ) -> None:
-    from twin.setup.unpaced import play_unpaced
-
     with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
         play_unpaced(config, run, folder / "run.mcap", poll_interrupt, progress)
 

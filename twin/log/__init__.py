@@ -59,6 +59,7 @@ from twin.model.model import Model
 from twin.recording.reader import Recording, read_recording, read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import channel_unit, collect_steps
+from twin.results.contracts import RunSummary
 from twin.transport.codec import RECORD_TOPICS
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
@@ -224,6 +225,12 @@ class Log:
     @property
     def rate_hz(self) -> float:
         return self.start.rate_hz
+
+    @cached_property
+    def summary(self) -> RunSummary:
+        """Content of summary.json next to the log; InputError if there is none."""
+        folder = self.path.parent
+        return RunSummary.read(folder / "summary.json", f"run `shaketwin report {folder}`")
 
     @cached_property
     def profile(self) -> Profile:

@@ -2,8 +2,10 @@
 
 import csv
 import math
-from contextlib import nullcontext
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,34 +15,41 @@ from rich.table import Table
 from table_io.block import Block
 from table_io.clock import RealClock
 from table_io.errors import InputError
-from table_io.records import Comparison
 from twin.live.replay_publishing import open_publisher
-from twin.recording.reader import Recording, iter_valid_items, read_recording
+from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import parse_step_range
 from twin.replay.pipeline_replay import (
-    RecordedRun,
     ReplayComparison,
-    SampleRange,
-    compute_deviation,
     describe_deviation,
     replay_recording,
 )
-from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL, finalize_run
+from twin.replay.task import (
+    RECORDED,
+    describe_replay,
+    load_replay_config,
+    open_replay_log,
+    replay,
+    require_drive_channel,
+    select_span,
+)
+from twin.report.finalize import (
+    EXIT_GAPS,
+    EXIT_INTERRUPTED,
+    EXIT_NOT_IDENTICAL,
+    print_outcome,
+    show_progress,
+)
 from twin.results import summary as summaries
 from twin.results.contract import write_json
 from twin.results.contracts import Jump, ReplayResult, Response, RunSummary
-from twin.results.recordings import read_recorded_config, warn_if_damaged
-from twin.results.rerun import DRIVE_CHANNEL
 from twin.security.credentials import Credentials
 from twin.setup.folders import make_run_folder
-from twin.setup.run_config import RunConfig
-from twin.setup.warm_up import compile_kernels
-from twin.system.progress import RunProgress
+from twin.setup.unpaced import ItemHandler, ShownRun
 from twin.system.terminal import console, print_line, print_table
-from twin.system.versions import find_version_changes, format_version_changes
+from twin.system.versions import format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item
-from twin.transport.endpoint import CMP_TOPIC, MEAS_TOPIC, PRED_TOPIC
+from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
 Row = dict[str, Any]
 PRC_QUANTITIES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
@@ -48,7 +57,6 @@ TABLE_COLUMNS = {
     "u": "nrmse rel_disp_m", "a": "nrmse mass_acc_m_s2", "F_R": "nrmse force_r1_n",
     "F_L": "nrmse force_l1_n", "u free": "free_nrmse rel_disp_m", "PRC eta_d": "prc eta_d",
 }  # fmt: skip
-RECORDED = "recorded"  # model name: the model stored in the log
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,117 +92,46 @@ def replay_logs(request: ReplayRequest) -> int:
         return EXIT_INTERRUPTED
 
 
-def open_replay_log(log: Path) -> RecordedRun:
-    """Open a log for replay; InputError if it lacks the channel that drives the twin."""
-    recorded = RecordedRun.open(resolve_log_path(log))
-    warn_if_damaged(recorded.recording)
-    require_drive_channel(recorded.recording)
-    return recorded
-
-
-def require_drive_channel(recording: Recording) -> None:
-    """Raise InputError if a recording lacks the channel that drives the twin."""
-    channels = recording.start.channels
-    if DRIVE_CHANNEL not in channels:
-        raise InputError(
-            f"not recorded, but it drives the twin; there: {', '.join(channels)}",
-            where=recording.path,
-            key=DRIVE_CHANNEL,
-            remedy="import the table's acceleration too",
-        )
-
-
-def load_replay_config(recording: Recording, model: str | None) -> RunConfig:
-    """Return the `RunConfig` of a recording, with `model` in place of the recorded one if given."""
-    config = read_recorded_config(recording, None if model in (None, RECORDED) else model)
-    compile_kernels(config)
-    return config
-
-
-def select_span(recording: Recording, steps: str | None) -> SampleRange:
-    """Return the samples of the selected steps, all if `steps` is None."""
-    if steps is None:
-        return SampleRange.all_samples(recording)
-    return SampleRange.of_steps(recording, *parse_step_range(steps))
-
-
 def _replay_one(request: ReplayRequest) -> int:
-    recorded = open_replay_log(request.logs[0])
-    model = request.models[0] if request.models else None
-    recording = recorded.recording
-    config, span = load_replay_config(recording, model), select_span(recording, request.steps)
-    speed, rate_hz = parse_speed(request.speed), recorded.start.rate_hz
-    is_observed = speed is not None or request.publish is not None
-    block_samples = recorded.start.block_samples if is_observed else 0
-    publishing = (
-        open_publisher(config, request.publish, request.keys) if request.publish else nullcontext()
+    speed = parse_speed(request.speed)
+    replayed = replay(
+        request.logs[0],
+        request.out,
+        request.models[0] if request.models else None,
+        request.steps,
+        request.view,
+        partial(_observe, request, speed),
+        in_blocks=speed is not None or request.publish is not None,
     )
-    clock = RealClock()
-    samples = min(config.drive.planned_end, span.last)
-    with publishing as publisher, RunProgress(console, len(config.steps), samples) as progress:
-        folder, run = make_run_folder(request.out, f"{config.name}-replay")
+    code = print_outcome(replayed.summary, replayed.path.parent, len(replayed.start.steps))
+    print_line(format_identity(replayed.identity, replayed.result))
+    is_same = replayed.result.model == RECORDED
+    return EXIT_NOT_IDENTICAL if is_same and replayed.identity.differs else code
+
+
+@contextmanager
+def _observe(request: ReplayRequest, speed: float | None, run: ShownRun) -> Iterator[ItemHandler]:
+    """Show the progress of a replay, at a multiple of real time if `speed`; publish if asked."""
+    publishing = (
+        open_publisher(run.config, request.publish, request.keys)
+        if request.publish
+        else nullcontext()
+    )
+    clock, rate_hz = RealClock(), run.config.drive.rate_hz
+    with publishing as publisher, show_progress(run) as progress:
         if publisher is not None:
-            publisher.start(run, at_once=speed is not None)
+            publisher.start(run.run, at_once=speed is not None)
         began_s = clock.now()
 
         def on_item(item: Item) -> None:
             if speed is not None:
-                offset = (item.end if isinstance(item, Block) else item.index) - span.first
+                offset = (item.end if isinstance(item, Block) else item.index) - run.first
                 clock.wait_until(began_s + offset / rate_hz / speed)
             if publisher is not None:
                 publisher.publish(item)
             progress(item)
 
-        identity = replay_recording(
-            recorded, config, folder / "run.mcap", run, on_item, span, block_samples
-        )
-    entry = describe_replay(recorded, config, model, identity, folder / "run.mcap")
-    code = finalize_run(folder, config, request.view, entry)
-    print_line(format_identity(identity, entry))
-    same = config.model_toml == recorded.start.model_toml
-    return EXIT_NOT_IDENTICAL if same and identity.differs else code
-
-
-def describe_replay(
-    recorded: RecordedRun,
-    config: RunConfig,
-    model: str | None,
-    identity: ReplayComparison,
-    log: Path,
-) -> ReplayResult:
-    """Compare a replay with its recording."""
-    recording = recorded.recording
-    same = config.model_toml == recording.start.model_toml
-    payloads = [payload for _, payload in sorted(recorded.comparisons.items())]
-    recorded_items = [*iter_valid_items(CMP_TOPIC, payloads, recording.start, [])]
-    return ReplayResult(
-        of=str(recording.path),
-        run=recording.run,
-        model=RECORDED if same else model,
-        identical=identity.is_identical,
-        beginning=identity.beginning or None,
-        comparisons=identity.recorded,
-        compared=identity.compared,
-        differing=identity.differing,
-        missing=identity.missing,
-        unrecorded=identity.unrecorded,
-        lost_with_twin=identity.lost_with_twin,
-        hashes=identity.hashes,
-        hashes_compared=identity.hashes_compared,
-        hashes_differing=identity.hashes_differing,
-        predictions_compared=identity.predictions_compared,
-        predictions_differing=identity.predictions_differing,
-        first_difference_index=identity.first_difference,
-        largest_difference_of_error_sums=identity.largest,
-        relative_difference=compute_deviation(recording.path, log) if identity.differs else {},
-        versions_differing=find_version_changes(recording.start.versions),
-        recorded_comparison=summaries.channel_nrmse(
-            tuple(item for item in recorded_items if isinstance(item, Comparison)),
-            config.parameters,
-            config.rig.channel_by_name,
-            summaries.find_channel_noise(recording),
-        ),
-    )
+        yield on_item
 
 
 def format_identity(identity: ReplayComparison, entry: ReplayResult) -> str:

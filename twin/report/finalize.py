@@ -9,6 +9,8 @@ from twin.results.rerun import restore_predictions
 from twin.results.summary import format_summary, summarise
 from twin.results.twin_verdict import format_twin_verdict
 from twin.setup.run_config import RunConfig
+from twin.setup.unpaced import ShownRun
+from twin.system.progress import RunProgress
 from twin.system.terminal import console, print_line
 
 VERDICT_COLOURS = {
@@ -21,10 +23,15 @@ VERDICT_COLOURS = {
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
-def finalize_run(
+def show_progress(run: ShownRun) -> RunProgress:
+    """Return the progress of a run on the console, for a task to enter."""
+    return RunProgress(console, len(run.config.steps), run.last)
+
+
+def write_results(
     folder: Path, run_config: RunConfig, view: bool = False, replay: ReplayResult | None = None
-) -> int:
-    """Write summary, report and optional view, print a one-line summary; return the exit code."""
+) -> RunSummary:
+    """Write summary, report and optional view of the run in a folder; return the summary."""
     from twin.report.report import write_report
 
     recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
@@ -37,7 +44,12 @@ def finalize_run(
         from twin.viewer.view import write_rrd
 
         write_rrd(recording, folder / "view.rrd")
-    result = format_summary(summary, len(run_config.steps))
+    return summary
+
+
+def print_outcome(summary: RunSummary, folder: Path, planned_steps: int) -> int:
+    """Print a run's summary in one line, and the verdicts; return the exit code."""
+    result = format_summary(summary, planned_steps)
     print_line(f"test {result} -> {folder / 'report.html'}")
     print_twin_verdict(summary, folder)
     if summary.verdict != "complete":

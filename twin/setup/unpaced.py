@@ -2,6 +2,8 @@
 
 import math
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +28,24 @@ ItemHandler = Callable[[Item], None]
 PayloadHandler = Callable[[Item, bytes], None]
 FLUSH_INTERVAL_S = 5.0  # of recorded time
 SIMULATED_BLOCK_SAMPLES = 500
+
+
+@dataclass(frozen=True, eq=False)
+class ShownRun:
+    """Run that a task is about to make: samples `first` up to `last`, which is not among them."""
+
+    config: RunConfig
+    run: str
+    first: int
+    last: int
+
+
+Observe = Callable[[ShownRun], AbstractContextManager[ItemHandler]]
+
+
+def observe_nothing(_: ShownRun) -> AbstractContextManager[ItemHandler]:
+    """Show no item of a run."""
+    return nullcontext(lambda item: None)
 
 
 def record_items(

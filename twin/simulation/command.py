@@ -5,12 +5,8 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign.config import find_campaign
-from twin.report.finalize import finalize_run
-from twin.setup.folders import make_run_folder
-from twin.setup.run_config import read_run_config
-from twin.setup.warm_up import compile_kernels
-from twin.system.progress import RunProgress
-from twin.system.terminal import console
+from twin.report.finalize import print_outcome, show_progress
+from twin.simulation.task import simulate
 
 
 def simulate_profile(
@@ -55,11 +51,5 @@ def simulate_profile(
 
 def _simulate_one(profile: Path, model: str | None, out: Path | None, view: bool) -> int:
     """Simulate one model at the profile's gap; return the exit code."""
-    from twin.setup.unpaced import simulate_ideal as play
-
-    config = read_run_config(profile, None, model)
-    compile_kernels(config)
-    folder, run = make_run_folder(out, f"{config.name}-model")
-    with RunProgress(console, len(config.steps), config.drive.planned_end) as progress:
-        play(config, run, folder / "run.mcap", progress)
-    return finalize_run(folder, config, view)
+    log = simulate(profile, out, model, view, show_progress)
+    return print_outcome(log.summary, log.path.parent, len(log.start.steps))
