@@ -1,5 +1,6 @@
 """The tutorials run as they are written, each cell, in a folder of its own."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,6 @@ import matplotlib as mpl
 import pytest
 from matplotlib import pyplot as plt
 
-from twin.guide.notebook import list_code
 from twin.guide.site import CHAPTERS, TUTORIALS_DIR
 
 # Each runs a test and discovers or fits; the fast ones are enough to see that the interface holds.
@@ -21,7 +21,9 @@ TUTORIALS = [
 def run_cells(path: Path) -> dict[str, Any]:
     """Run the code cells of a notebook in order; return its names."""
     names: dict[str, Any] = {"__name__": "__main__"}
-    for number, cell in enumerate(list_code(path.read_text(encoding="utf-8"))):
+    cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+    codes = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    for number, cell in enumerate(codes):
         exec(compile(cell, f"{path.name}, cell {number}", "exec"), names)
     return names
 

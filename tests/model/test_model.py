@@ -205,14 +205,6 @@ def test_relaxing_face_without_viscous_damping_is_refused():
         model.with_effect("bumper_maxwell", kb=1e5, tau=0.1)
 
 
-def test_a_card_for_those_who_know_only_parameters():
-    card = parse_toml(CARD + '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 5.0 }',
-                 ModelConfig, "x")  # fmt: skip
-    with raises_input_error(problem="coulomb_friction") as error:
-        card.build_parameters(G4)
-    assert error.value.allowed
-
-
 def test_restart_takes_hidden_states_and_refuses_nan():
     model = everything()
     solver = prepare_solver(model, RATE_HZ)

@@ -28,19 +28,19 @@ G4 = Specimen(mass_kg=550.0, gap_mm=4.0)
 
 def test_the_papers_card_is_the_papers_model():
     card, _ = load_config(find_config("snm", "models"), ModelConfig, "model")
-    assert card.build_parameters(G4) == snm()
-    assert card.build_parameters(Specimen(mass_kg=550.0, gap_mm=math.inf)) == snm(math.inf)
+    assert card.build_model(G4).parameters == snm()
+    assert card.build_model(Specimen(mass_kg=550.0, gap_mm=math.inf)).parameters == snm(math.inf)
 
 
 def test_measured_gaps_take_the_place_of_the_nominal_one():
     specimen = Specimen(mass_kg=550.0, gap_mm=4.0, gap_right_mm=2.2, gap_left_mm=1.7)
-    built = parse_toml(CARD, ModelConfig, "x").build_parameters(specimen)
+    built = parse_toml(CARD, ModelConfig, "x").build_model(specimen).parameters
     assert (built.gap_r, built.gap_l) == pytest.approx((2.2e-3, 1.7e-3))
 
 
 def test_effects_of_a_card_apply_in_order():
     text = CARD + '[[effects]]\nid = "gap_offset"\nparameters = { offset = 2e-4 }\n'
-    built = parse_toml(text, ModelConfig, "x").build_parameters(G4)
+    built = parse_toml(text, ModelConfig, "x").build_model(G4).parameters
     assert (built.gap_r, built.gap_l) == pytest.approx((2.2e-3, 1.8e-3))
 
 

@@ -13,12 +13,6 @@ def convert_notebook(text: str, name: str) -> str:
     return "\n\n".join(parts)
 
 
-def list_code(text: str) -> list[str]:
-    """Return the code cells of a notebook."""
-    cells = json.loads(text)["cells"]
-    return ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
-
-
 def _convert_cell(cell: dict[str, Any]) -> Iterator[str]:
     source = "".join(cell["source"])
     if cell["cell_type"] != "code":

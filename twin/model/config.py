@@ -161,22 +161,6 @@ class ModelConfig(ConfigModel):
         )
         return Model(parameters, tuple(entry.instance for entry in self.effects))
 
-    def build_parameters(self, specimen: Specimen) -> Parameters:
-        """Return the model as plain `Parameters`; InputError if it has any other effects."""
-        model = self.build_model(specimen)
-        unsupported = [
-            instance.name
-            for instance in model.present_effects
-            if instance.effect.acts != "parameters"
-        ]
-        if unsupported:
-            raise InputError(
-                f"model {self.title!r} has {', '.join(unsupported)}",
-                allowed="effects that only change parameters",
-                remedy="use a model without the others",
-            )
-        return model.parameters
-
 
 def load_model_config(path: Path) -> tuple[ModelConfig, str]:
     """Load a model file and the effect files that it names: return (config, text with them).

@@ -6,7 +6,6 @@ from typing import Protocol
 from table_io.block import Float1D, Float2D
 
 OUTPUT_COUNT = 7  # rows: u, v, a, F_R, F_L, u_r, u_l
-GRAVITY_M_S2 = 9.80665
 
 
 @dataclass(frozen=True, slots=True)
