@@ -26,10 +26,14 @@ from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_d
 from twin.exchange.drive_file import DriveOptions, ExportedDrive, export_drive
 from twin.exchange.export import Exported, ExportOptions, export_log
 from twin.exchange.import_table import Imported, ImportOptions, import_data, import_table
+from twin.inspection.curves import RecordedCurves, read_curves
+from twin.inspection.folder_report import write_folder_report
 from twin.live.run_command import run_simulated
 from twin.log import Log, open_log
 from twin.replay.task import ReplayedLog, replay
 from twin.replay.verify import Verification, repair_log, verify
+from twin.report.compare_command import ComparedRuns, compare_runs
+from twin.report.run_index import RunRow, index_runs
 from twin.rig.calibrate import CalibratedSensor, CalibrationOptions, calibrate
 from twin.rig.check import CheckedTest, check_test
 from twin.rig.check_table import WiringCheckResult, check_table
@@ -43,6 +47,7 @@ __all__ = [
     "CalibratedSensor",
     "CalibrationOptions",
     "CheckedTest",
+    "ComparedRuns",
     "DecideOptions",
     "DecidedTests",
     "DiscoveredModel",
@@ -63,7 +68,9 @@ __all__ = [
     "Interval",
     "Log",
     "MapOptions",
+    "RecordedCurves",
     "ReplayedLog",
+    "RunRow",
     "SimulatedGaps",
     "SimulatedSweeps",
     "StoredMap",
@@ -77,6 +84,7 @@ __all__ = [
     "calibrate",
     "check_table",
     "check_test",
+    "compare_runs",
     "compute_drive",
     "compute_map",
     "decide",
@@ -89,8 +97,10 @@ __all__ = [
     "identify_table",
     "import_data",
     "import_table",
+    "index_runs",
     "open_log",
     "open_study",
+    "read_curves",
     "repair_log",
     "replay",
     "run_simulated",
@@ -98,4 +108,5 @@ __all__ = [
     "simulate_gaps",
     "simulate_sweeps",
     "verify",
+    "write_folder_report",
 ]

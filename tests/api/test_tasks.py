@@ -31,7 +31,11 @@ TASKS = {
     "identify": ("identify",),
     "import": ("import_table",),
     "map": ("compute_map",),
+    "compare": ("compare_runs",),
+    "prc": ("read_curves",),
     "replay": ("replay",),
+    "report": ("write_folder_report",),
+    "runs": ("index_runs",),
     "simulate": ("simulate",),
     "table-drive": ("compute_drive",),
     "table-twin": ("identify_table",),
@@ -40,7 +44,7 @@ TASKS = {
 
 
 def list_called_names(module: str) -> set[str]:
-    """Return the names of twin that the modules of a command's room import or define."""
+    """Return the names of the functions that the modules in the folder of a module call."""
     folder = (ROOT / module.replace(".", "/")).parent
     trees = [ast.parse(path.read_text()) for path in folder.glob("*.py")]
     return {
@@ -55,12 +59,12 @@ def list_called_names(module: str) -> set[str]:
 def test_a_command_calls_the_function_of_the_api(command: str) -> None:
     """Which is defined once, in the rooms, and never in `twin.api`."""
     (row,) = (row for row in COMMANDS if row.name == command)
-    room = row.target.partition(":")[0].rpartition(".")[0]
+    module = row.target.partition(":")[0]
     for name in TASKS[command]:
         task = getattr(api, name)
         assert name in api.__all__
-        assert task.__module__.startswith(f"{room}.")
-        assert name in list_called_names(row.target.partition(":")[0])
+        assert task.__module__ != api.__name__
+        assert name in list_called_names(task.__module__) | list_called_names(module)
 
 
 def read_json(path: Path) -> dict[str, object]:
@@ -75,6 +79,27 @@ def compare_branches(log: Path, folder: Path) -> tuple[object, object]:
     api.follow_branches(api.BranchOptions("quickstart", low=3.0, high=3.2, out=folder / "python"))
     returned, written = (folder / name / "branches.json" for name in ("python", "shell"))
     return returned.read_text(), written.read_text()
+
+
+def compare_curves(log: Path, folder: Path) -> tuple[object, object]:
+    result = call_main("prc", log, "--json")
+    return format_json(api.read_curves(log).to_plain()), result.stdout.rstrip("\n")
+
+
+def compare_comparisons(log: Path, folder: Path) -> tuple[object, object]:
+    """With the page that is written next to it, and the index of both runs."""
+    runs = [api.replay(log, folder / name).path.parent for name in ("first", "second")]
+    assert call_main("compare", *runs, "--out", folder / "shell").returncode == 0
+    compared = api.compare_runs(*runs)
+    (folder / "python").mkdir()
+    compared.write(folder / "python")
+    listed = json.loads(call_main("runs", folder, "--json").stdout)["runs"]
+    assert [asdict(run) for run in api.index_runs(folder)] == listed
+    returned, written = (
+        [(folder / name / file).read_text() for file in ("comparison.json", "compare.html")]
+        for name in ("python", "shell")
+    )
+    return returned, written
 
 
 def compare_drives(log: Path, folder: Path) -> tuple[object, object]:
@@ -162,6 +187,14 @@ def drop_run(summary: Mapping[str, Any]) -> dict[str, Any]:
     return {**summary, "run": None}
 
 
+def compare_reports(log: Path, folder: Path) -> tuple[object, object]:
+    run = api.replay(log, folder / "run", steps="0:2").path.parent
+    assert call_main("report", run).returncode == 0
+    written = (run / "report.html").read_text()
+    (page,) = api.write_folder_report(run)
+    return page.read_text(), written
+
+
 def compare_simulations(log: Path, folder: Path) -> tuple[object, object]:
     (folder / "test.toml").write_text(api.open_log(log).start.profile_toml)
     assert call_main("simulate", folder / "test.toml", "--out", folder / "shell").returncode == 0
@@ -198,6 +231,8 @@ def compare_wirings(log: Path, folder: Path) -> tuple[object, object]:
     "compare",
     [
         compare_branches,
+        compare_comparisons,
+        compare_curves,
         compare_drives,
         compare_exports,
         compare_fits,
@@ -207,6 +242,7 @@ def compare_wirings(log: Path, folder: Path) -> tuple[object, object]:
         compare_repairs,
         compare_sweeps,
         compare_replays,
+        compare_reports,
         compare_simulations,
         compare_verifications,
         compare_wirings,

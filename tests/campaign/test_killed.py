@@ -20,7 +20,8 @@ from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.figures import prc_families
 from twin.campaign.summary import read_campaign
 from twin.drawing.prc_families import draw_all_gaps
-from twin.inspection import command as reading
+from twin.inspection.curves import print_curves
+from twin.inspection.folder_report import write_folder_report
 from twin.live.process_config import ProcessConfig
 from twin.recording.reader import read_recording
 from twin.setup.unpaced import play_unpaced
@@ -247,14 +248,14 @@ def test_the_report_is_written_anew_from_the_folder_alone(
     before = summary(both.killed)
     (both.killed / "summary.json").unlink()
     monkeypatch.setattr(report, "draw_campaign_figures", lambda *_: [])
-    reading.write_folder_report(both.killed)
+    write_folder_report(both.killed)
     assert summary(both.killed) == before
 
 
 def test_the_curves_of_a_campaign_are_those_of_its_joined_runs(
     both: Both, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    reading.print_recording_prc(both.killed, True)
+    print_curves(both.killed, True)
     runs = json.loads(capsys.readouterr().out)["runs"]
     merged = summary(both.killed)["runs"]
     assert [run["hysteresis"] for run in runs] == [run["hysteresis"] for run in merged]

@@ -190,7 +190,7 @@ def test_help_and_a_stop_order_are_quick(module: str, slow: str) -> None:
 def test_only_a_report_imports_what_draws_and_scipy_signal_is_for_discovery() -> None:
     code = (
         "import sys; slow = {'matplotlib', 'scipy.signal'}; "
-        "import twin.inspection.command; print(sorted(slow & set(sys.modules))); "
+        "import twin.inspection.curves; print(sorted(slow & set(sys.modules))); "
         "import twin.report.report; print(sorted(slow & set(sys.modules)))"
     )
     result = subprocess.run(

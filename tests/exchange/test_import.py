@@ -14,7 +14,7 @@ from tests.input_errors import raises_input_error
 from tests.setup.test_unpaced import QUICK, play_run
 from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import ImportOptions, import_table
-from twin.inspection.command import print_recording_prc
+from twin.inspection.curves import print_curves
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.results.recordings import read_recorded_config
@@ -105,7 +105,7 @@ def test_prc_of_an_import_is_that_of_the_run(
 def test_prc_and_replay_read_an_imported_log(
     imported_log: Recording, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    print_recording_prc(imported_log.path, True)
+    print_curves(imported_log.path, True)
     assert '"frequency_hz": 3.6' in capsys.readouterr().out
     assert replay_logs(ReplayRequest([imported_log.path], [], tmp_path / "again")) == 0
     assert len(read_recording(tmp_path / "again" / "run.mcap").records(PrcPoint)) == len(

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from table_io.errors import InputError
-from twin.inspection.command import print_recording_prc
+from twin.inspection.curves import print_curves
 from twin.recording.run_paths import resolve_log_path
 
 
@@ -22,6 +22,6 @@ def test_a_folder_without_a_recording_is_named_as_typed(
     (tmp_path / "full" / "notes.txt").touch()
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError) as error:
-        print_recording_prc(Path("full"), False)
+        print_curves(Path("full"), False)
     assert error.value.where == "full"
     assert "run.mcap" in error.value.remedy

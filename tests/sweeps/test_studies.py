@@ -18,7 +18,7 @@ import pytest
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
 from tests.input_errors import raises_input_error
-from twin.inspection.command import write_folder_report
+from twin.inspection.folder_report import write_folder_report
 from twin.laws.effect import Effect, EffectParameter
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model

@@ -32,9 +32,9 @@ def prc_command(
     json: JsonOption = False,
 ) -> None:
     """Print pseudo-resonance curves, jumps, hysteresis, impacts per cycle."""
-    from twin.inspection.command import print_recording_prc
+    from twin.inspection.curves import print_curves
 
-    print_recording_prc(log, json)
+    print_curves(log, json)
 
 
 def report_command(
@@ -52,9 +52,9 @@ def report_command(
     ] = False,
 ) -> None:
     """Write the report of a run or campaign again: one self-contained HTML file."""
-    from twin.inspection.command import write_folder_report
+    from twin.inspection.folder_report import print_report
 
-    write_folder_report(folder, output is ReportFormat.pdf, figures)
+    print_report(folder, output is ReportFormat.pdf, figures)
 
 
 def view_command(
@@ -106,6 +106,6 @@ def compare_command(
     out: OutOption = None,
 ) -> None:
     """Compare two runs, or one with two models: curves, jumps, parameters, misfit."""
-    from twin.report.compare_command import compare_runs
+    from twin.report.compare_command import print_compared_runs
 
-    compare_runs(first, second, json, out)
+    print_compared_runs(first, second, json, out)

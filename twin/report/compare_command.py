@@ -1,6 +1,6 @@
 """`compare`: two runs side by side, on the console, as JSON and as a page."""
 
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.table import Table
@@ -8,6 +8,7 @@ from rich.table import Table
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.report.run_comparison import ComparedRun, RunComparison, compare_summaries
+from twin.report.run_comparison_page import write_comparison_page
 from twin.results.contract import format_json, write_json
 from twin.results.contracts import RunSummary
 from twin.results.quantities import format_quantity
@@ -16,24 +17,43 @@ from twin.setup.folders import make_run_folder
 from twin.system.terminal import console, print_line, print_table
 
 
-def compare_runs(first: Path, second: Path, as_json: bool, out: Path | None) -> None:
+@dataclass(frozen=True, eq=False)
+class ComparedRuns:
+    """Two runs and how they differ, `comparison`, which is the content of comparison.json."""
+
+    first: ComparedRun
+    second: ComparedRun
+    comparison: RunComparison
+
+    def write(self, folder: Path) -> Path:
+        """Write comparison.json and compare.html to a folder; return the path of the page."""
+        write_json(asdict(self.comparison), folder / "comparison.json")
+        return write_comparison_page(folder, self.first, self.second, self.comparison)
+
+
+def compare_runs(first: str | Path, second: str | Path) -> ComparedRuns:
+    """Compare two runs by their logs or folders: curves, jumps, parameters, misfit.
+
+    InputError for a run without summary.json.
+    """
+    runs = [_load_run(Path(path)) for path in (first, second)]
+    return ComparedRuns(runs[0], runs[1], compare_summaries(*runs))
+
+
+def print_compared_runs(first: Path, second: Path, as_json: bool, out: Path | None) -> None:
     """Print the comparison of two runs; write compare.html and comparison.json, unless as JSON.
 
     As JSON files are written only to `out`.
     """
-    runs = [_load_run(path) for path in (first, second)]
-    comparison = compare_summaries(*runs)
+    compared = compare_runs(first, second)
     if as_json:
-        print(format_json(asdict(comparison)))
+        print(format_json(asdict(compared.comparison)))
     else:
-        _print_comparison(comparison)
+        _print_comparison(compared.comparison)
     if as_json and out is None:
         return
-    from twin.report.run_comparison_page import write_comparison_page  # slow to import
-
     folder, _ = make_run_folder(out, "compare")
-    write_json(asdict(comparison), folder / "comparison.json")
-    page = write_comparison_page(folder, runs[0], runs[1], comparison)
+    page = compared.write(folder)
     if not as_json:
         print_line(f"{page}")
 

@@ -1,0 +1,69 @@
+"""`report`: the report of a run, campaign, simulated sweeps or map, written again."""
+
+from pathlib import Path
+
+from table_io.errors import InputError
+from twin.campaign import STATE_FILE
+from twin.campaign.report import write_campaign_report
+from twin.recording.merge import merge_run_parts
+from twin.recording.run_paths import PARTS_FOLDER
+from twin.report.pdf_report import write_pdf_report
+from twin.report.report import load_report_data, write_report
+from twin.results.recordings import open_recording, read_recorded_config
+from twin.results.summary import summarise
+from twin.studies import DEFINITION_FILE, TABLE_FILE
+from twin.studies.maps.page import write_map_page
+from twin.studies.page import write_study_page
+from twin.system.terminal import print_line
+
+FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
+
+
+def write_folder_report(
+    folder: str | Path, as_pdf: bool = False, all_formats: bool = False
+) -> tuple[Path, ...]:
+    """Rewrite report.html in the folder of a run, campaign, batch or map; return the new pages.
+
+    A run or campaign is reported from its recordings, a batch from its table, a map from its
+    arrays. Of a run also report.pdf, and each figure in all formats, where asked for.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
+    if (folder / PARTS_FOLDER).is_dir():
+        merge_run_parts(folder)
+    if as_pdf or all_formats:
+        _require_run(folder, "--format pdf" if as_pdf else "--figures")
+    if (folder / STATE_FILE).is_file():
+        return (write_campaign_report(folder),)
+    if (folder / TABLE_FILE).is_file():
+        return (write_study_page(folder),)
+    if (folder / DEFINITION_FILE).is_file():
+        return (write_map_page(folder),)
+    recording = open_recording(folder)
+    if not (folder / "summary.json").exists():
+        summary = summarise(recording, read_recorded_config(recording).parameters)
+        summary.write(folder / "summary.json")
+    page = write_report(folder, recording, FIGURE_FORMATS if all_formats else ())
+    if not as_pdf:
+        return (page,)
+    path = folder / "report.pdf"
+    write_pdf_report(load_report_data(folder, recording), path)
+    return page, path
+
+
+def print_report(folder: Path, as_pdf: bool, all_formats: bool) -> None:
+    """Write the report of a folder again and print its pages."""
+    for page in write_folder_report(folder, as_pdf, all_formats):
+        print_line(f"{page}")
+
+
+def _require_run(folder: Path, option: str) -> None:
+    """Raise InputError if the folder is that of a campaign, batch or map."""
+    if any((folder / name).is_file() for name in (STATE_FILE, TABLE_FILE, DEFINITION_FILE)):
+        raise InputError(
+            "the report of a campaign, batch or map is a page only",
+            where=option,
+            allowed="the folder of a run",
+            remedy="give the folder of one of its runs",
+        )
