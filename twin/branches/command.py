@@ -31,5 +31,5 @@ def print_bifurcations(branches: BranchSet) -> None:
         right = header not in ("kind", "what happens")
         table.add_column(header, justify="right" if right else "left")
     for row in rows:
-        table.add_row(row["kind"], row["x"], row["u"], str(row["period"]), row["meaning"])
+        table.add_row(row.kind, row.x, row.u, str(row.period), row.meaning)
     console.print(table)

@@ -2,11 +2,13 @@
 
 import csv
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from twin.branches.result import BranchDiagram, OrbitEntry
 from twin.drawing.attractor_study import AttractorStudy
 from twin.drawing.branch_curves import (
     BranchSet,
@@ -23,7 +25,6 @@ from twin.drawing.branch_figures import (
 from twin.drawing.page import embed_images, render_page
 from twin.dynamics.continuation import Branch, BranchEnd
 from twin.dynamics.orbits import Orbit
-from twin.results.contract import Json, write_json
 
 PORTRAIT_SAMPLES = 96  # per period, of the motion that the page shows
 MAX_PORTRAIT_SAMPLES = 384
@@ -42,8 +43,9 @@ def write_branch_report(
     Return the path of the page.
     """
     pictures = draw_branch_figures(branches, folder / "figures", attractors)
-    write_json(make_summary(branches, title), folder / "branches.json")
-    write_table(branches, folder / "branches.csv")
+    diagram = BranchDiagram.from_branches(branches, title)
+    diagram.write(folder / "branches.json")
+    write_table(diagram, folder / "branches.csv")
     data = make_page_data(branches)
     text = render_page(
         Path(__file__).with_name("page.html"),
@@ -52,7 +54,7 @@ def write_branch_report(
         headline=format_branch_headline(branches),
         parameter=branches.axis.label,
         bifurcations=list_bifurcations(branches),
-        branches=[_branch_row(branches, branch) for branch in branches.branches],
+        branches=[_make_row(branches, branch) for branch in branches.branches],
         images=embed_images(pictures),
         model=model_toml,
         data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
@@ -62,71 +64,20 @@ def write_branch_report(
     return path
 
 
-def make_summary(branches: BranchSet, title: str) -> Json:
-    """Return the content of branches.json: every branch, bifurcation and chaotic range, in SI."""
-    return {
-        "title": title,
-        "parameter": branches.axis.name,
-        "branches": [
-            {
-                "periods": branch.points[0].orbit.periods,
-                "ends": [
-                    {"reason": end.reason, "value": end.value, "residual": end.residual}
-                    for end in branch.ends
-                ],
-                "bifurcations": [
-                    {
-                        "kind": item.kind, "value": item.value, "index": item.index,
-                        "frequency_hz": item.orbit.frequency_hz,
-                        "level_m_s2": item.orbit.acceleration_m_s2, "side": item.side,
-                        "turns_back": item.turns_back,
-                    }
-                    for item in branch.bifurcations
-                ],
-                "points": [_point(point.value, point.orbit) for point in branch.points],
-            }
-            for branch in branches.branches
-        ],
-        "chaotic": [list(band) for band in branches.chaotic],
-    }  # fmt: skip
-
-
-def _point(value: float, orbit: Orbit) -> Json:
-    right, left = count_impacts(orbit)
-    return {
-        "value": value,
-        "u_max_m": orbit.extreme("u_max"),
-        "u_min_m": orbit.extreme("u_min"),
-        "a_max_m_s2": orbit.extreme("a_max"),
-        "a_min_m_s2": orbit.extreme("a_min"),
-        "force_r_n": orbit.extreme("f_r_max"),
-        "force_l_n": orbit.extreme("f_l_min"),
-        "impacts_right": right,
-        "impacts_left": left,
-        "stable": orbit.stable,
-        "multipliers": [[value.real, value.imag] for value in orbit.multipliers.tolist()],
-    }
-
-
-def write_table(branches: BranchSet, path: Path) -> None:
+def write_table(diagram: BranchDiagram, path: Path) -> None:
     """Write one row per point as CSV, in SI, without loss of precision."""
-    columns = [
-        "branch", "periods", branches.axis.name, "u_max_m", "u_min_m", "a_max_m_s2", "a_min_m_s2",
-        "force_r_n", "force_l_n", "impacts_right", "impacts_left", "stable",
-        "largest_multiplier_real", "largest_multiplier_imag",
-    ]  # fmt: skip
+    names = [name for name in OrbitEntry.model_fields if name not in ("value", "multipliers")]
+    multiplier = ("largest_multiplier_real", "largest_multiplier_imag")
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
-        for number, branch in enumerate(branches.branches, 1):
+        writer.writerow(["branch", "periods", diagram.parameter, *names, *multiplier])
+        for number, branch in enumerate(diagram.branches, 1):
             for point in branch.points:
-                row = _point(point.value, point.orbit)
-                multipliers = row.pop("multipliers")
-                value = row.pop("value")
-                row["stable"] = int(row["stable"])
+                values = [getattr(point, name) for name in names[:-1]]
                 writer.writerow(
-                    [number, point.orbit.periods, value, *row.values(), *multipliers[0]]
-                )
+                    [number, branch.periods, point.value, *values, int(point.stable),
+                     *point.multipliers[0]]
+                )  # fmt: skip
 
 
 def format_branch_headline(branches: BranchSet) -> str:
@@ -155,33 +106,57 @@ def format_branch_headline(branches: BranchSet) -> str:
     return "; ".join(parts) + "."
 
 
-def list_bifurcations(branches: BranchSet) -> list[dict[str, Any]]:
+@dataclass(frozen=True, slots=True)
+class BifurcationRow:
+    """Row of the table of bifurcations, as text in displayed units."""
+
+    kind: str
+    x: str
+    u: str
+    period: int
+    meaning: str
+
+
+def list_bifurcations(branches: BranchSet) -> list[BifurcationRow]:
     """Return a row per bifurcation, in order of the parameter."""
     factor = branches.axis.factor
     quantity = branches.quantities[0]
     return [
-        {
-            "kind": item.kind,
-            "x": f"{factor * item.value:.6g}",
-            "u": f"{quantity.of(item.orbit):.4g}",
-            "period": item.orbit.periods,
-            "meaning": describe_bifurcation(item),
-        }
+        BifurcationRow(
+            item.kind,
+            f"{factor * item.value:.6g}",
+            f"{quantity.of(item.orbit):.4g}",
+            item.orbit.periods,
+            describe_bifurcation(item),
+        )
         for _, item in branches.bifurcations
     ]
 
 
-def _branch_row(branches: BranchSet, branch: Branch) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class BranchRow:
+    """Row of the table of branches, as text in displayed units."""
+
+    period: int
+    points: int
+    stable: str
+    low: str
+    high: str
+    begins: str
+    ends: str
+
+
+def _make_row(branches: BranchSet, branch: Branch) -> BranchRow:
     x = branches.x(branch)
-    return {
-        "period": branch.points[0].orbit.periods,
-        "points": len(branch.points),
-        "stable": f"{100 * np.mean(branch.stable):.0f} %",
-        "low": f"{x.min():.5g}",
-        "high": f"{x.max():.5g}",
-        "begins": format_end(branches, branch.ends[0]),
-        "ends": format_end(branches, branch.ends[1]),
-    }
+    return BranchRow(
+        branch.points[0].orbit.periods,
+        len(branch.points),
+        f"{100 * np.mean(branch.stable):.0f} %",
+        f"{x.min():.5g}",
+        f"{x.max():.5g}",
+        format_end(branches, branch.ends[0]),
+        format_end(branches, branch.ends[1]),
+    )
 
 
 def format_end(branches: BranchSet, end: BranchEnd) -> str:
@@ -190,13 +165,13 @@ def format_end(branches: BranchSet, end: BranchEnd) -> str:
     return f"{text}, residual {end.residual:.1e}" if end.residual else text
 
 
-def make_page_data(branches: BranchSet) -> Json:
+def make_page_data(branches: BranchSet) -> Mapping[str, object]:
     """Return what the page's script draws, in displayed units."""
     factor, quantities = branches.axis.factor, branches.quantities
     return {
         "parameter": {"label": branches.axis.label},
         "quantities": [{"key": quantity.key, "label": quantity.label} for quantity in quantities],
-        "branches": [_branch_data(branches, branch) for branch in branches.branches],
+        "branches": [_make_line(branches, branch) for branch in branches.branches],
         "bifurcations": [
             {
                 "x": factor * item.value,
@@ -224,7 +199,7 @@ def _marker_colour(kind: str) -> str:
     return "#8a929c" if colour == "white" else colour
 
 
-def _branch_data(branches: BranchSet, branch: Branch) -> Json:
+def _make_line(branches: BranchSet, branch: Branch) -> Mapping[str, object]:
     orbits = [point.orbit for point in branch.points]
     return {
         "period": orbits[0].periods,

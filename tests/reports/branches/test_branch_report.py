@@ -3,6 +3,7 @@
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,7 +85,7 @@ def test_the_summary_states_bifurcations_and_why_each_branch_ends(
 
 
 def test_the_page_shows_each_point_with_its_motion(branch: Branch, folder: Path) -> None:
-    data = make_page_data(BranchSet((branch,), (BAND_HZ,)))
+    data: Any = make_page_data(BranchSet((branch,), (BAND_HZ,)))
     (shown,) = data["branches"]
     assert shown["x"] == pytest.approx(branch.values.tolist(), rel=1e-6)
     amplitude_mm = 500 * (branch.extreme("u_max") - branch.extreme("u_min"))

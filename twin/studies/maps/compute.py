@@ -14,7 +14,7 @@ from twin.studies import DEFINITION_FILE
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, SweepPlan
 from twin.studies.maps.store import (
-    Json,
+    StoredChunk,
     hash_arrays,
     open_group,
     read_definition,
@@ -90,15 +90,15 @@ def _open_study(folder: Path, _: float) -> tuple[Study, Mapping[str, Any]]:
     InputError if this process has other versions than the study.
     """
     definition = read_definition(folder)
-    problem = find_version_problem(definition["versions"], read_study_versions())
+    problem = find_version_problem(definition.versions, read_study_versions())
     if problem:
         raise InputError(f"a worker has other versions than the study: {problem}", where=folder)
     study = Study.from_definition(definition, str(folder))
     return study, dict(open_group(folder, "r+").arrays())
 
 
-def compute_chunk(folder: Path, number: int) -> Json:
-    """Compute and store a chunk; return its line of the manifest, or {"error": reason}.
+def compute_chunk(folder: Path, number: int) -> StoredChunk | str:
+    """Compute and store a chunk; return its line of the manifest, or why it failed.
 
     The reason is one that every other chunk would have too, such as a full disk.
     """
@@ -112,11 +112,11 @@ def compute_chunk(folder: Path, number: int) -> Json:
         for name, computed in results.items():
             arrays[name][span] = computed
     except (InputError, OSError, MemoryError) as error:
-        return {"error": str(error) or type(error).__name__}
-    return {
-        "chunk": number,
-        "first": first,
-        "cases": span.stop - first,
-        "sha256": hash_arrays(results),
-        "failures": {first + index: reason for index, reason in sorted(failures.items())},
-    }
+        return str(error) or type(error).__name__
+    return StoredChunk(
+        chunk=number,
+        first=first,
+        cases=span.stop - first,
+        sha256=hash_arrays(results),
+        failures={first + index: reason for index, reason in sorted(failures.items())},
+    )

@@ -1,14 +1,15 @@
 """Page of a study: its plan, figures, indices and tables, from the stored results."""
 
 import csv
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from table_io.block import Float2D
 from twin.drawing.page import embed_images, render_page
 from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
+from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.results import StudyResults, format_plain, format_unit
 from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
 from twin.system.files import is_folder_locked
@@ -73,32 +74,44 @@ def analyse_sensitivity(results: StudyResults) -> dict[str, SensitivityIndices]:
     }
 
 
-def describe_range(results: StudyResults, index: int) -> dict[str, Any]:
-    """Return name, range and number of values of a parameter, as the page shows them."""
+@dataclass(frozen=True, slots=True)
+class ParameterRange:
+    """Name, range and number of values of a parameter, as the page shows them."""
+
+    name: str
+    range: str
+    values: str
+
+
+def describe_range(results: StudyResults, index: int) -> ParameterRange:
+    """Return range and number of values of a parameter."""
     parameter = results.study.config.parameters[index]
     low, high = parameter.limits
     unit = results.find_unit(parameter.name)
     ends = f"{format_plain(low)} to {format_plain(high)} {format_unit(unit)}"
     values = f"{parameter.grid_size} values" if results.is_grid else "samples"
     scale = ", evenly in the logarithm" if parameter.scale == "log" else ""
-    return {
-        "name": parameter.name,
-        "range": ends.replace("-", "−"),
-        "values": values + scale,
-    }
+    return ParameterRange(parameter.name, ends.replace("-", "−"), values + scale)
 
 
-def _summarise_variable(results: StudyResults, variable: Any) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class VariableSpread:
+    """Smallest, median and largest value of an outcome, and how many cases lack it."""
+
+    title: str
+    name: str
+    unit: str
+    quantiles: list[float | None]
+    missing: int
+
+
+def _summarise_variable(results: StudyResults, variable: OutcomeVariable) -> VariableSpread:
     values = results.read_by_case(variable.name)[results.stored_flags]
     finite = values[np.isfinite(values)]
     quantiles = np.quantile(finite, [0, 0.5, 1]).tolist() if finite.size else [None] * 3
-    return {
-        "title": variable.title,
-        "name": variable.name,
-        "unit": format_unit(variable.unit),
-        "quantiles": quantiles,
-        "missing": int(values.size - finite.size),
-    }
+    missing = int(values.size - finite.size)
+    unit = format_unit(variable.unit)
+    return VariableSpread(variable.title, variable.name, unit, quantiles, missing)
 
 
 def write_case_table(results: StudyResults, path: Path) -> bool:
@@ -116,7 +129,37 @@ def write_case_table(results: StudyResults, path: Path) -> bool:
     return True
 
 
-def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | None:
+@dataclass(frozen=True, slots=True)
+class FrontRows:
+    """Cases of a front, thinned out: values of the parameters and of both outcomes."""
+
+    title: str
+    rows: list[list[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class LeastCase:
+    """Case of a front with the least first outcome within a limit of the second; None without."""
+
+    title: str
+    limit: float
+    row: list[float] | None
+
+
+@dataclass(frozen=True, slots=True)
+class FrontTable:
+    """Fronts of a study as the page shows them, with their heads; outcomes `first`, `second`."""
+
+    heads: list[str]
+    least_heads: list[str]
+    first: str
+    second: str
+    groups: list[FrontRows]
+    least: list[LeastCase]
+    edges: list[str]
+
+
+def write_front_table(results: StudyResults, path: Path) -> FrontTable | None:
     """Write the cases of every front as CSV; return what the page shows of them."""
     front = results.study.config.front
     if front is None:
@@ -139,27 +182,24 @@ def write_front_table(results: StudyResults, path: Path) -> dict[str, Any] | Non
             thinned = np.unique(
                 np.linspace(0, len(cases) - 1, min(len(cases), MAX_FRONT_ROWS)).round().astype(int)
             )
-            groups.append({"title": group.title, "rows": [rows[index] for index in thinned]})
+            groups.append(FrontRows(group.title, [rows[index] for index in thinned]))
             for limit in front.limits:
                 case = group.find_least(limit)
                 row = None if case is None else read_row(case, without=front.each)
-                least.append({"title": group.title, "limit": limit, "row": row})
+                least.append(LeastCase(group.title, limit, row))
     by_name = {variable.name: variable for variable in results.scalars}
     first, second = (label_variable(by_name[name]) for name in front.minimise)
     heads = {name: results.label_parameter(name) for name in names}
-    return {
-        "heads": [*heads.values(), first, second],
-        "least_heads": [
-            *(head for name, head in heads.items() if name != front.each),
-            first,
-            second,
-        ],
-        "first": first,
-        "second": second,
-        "groups": groups,
-        "least": least,
-        "edges": _describe_edges(results, np.array(all_rows)),
-    }
+    least_heads = [head for name, head in heads.items() if name != front.each]
+    return FrontTable(
+        [*heads.values(), first, second],
+        [*least_heads, first, second],
+        first,
+        second,
+        groups,
+        least,
+        _describe_edges(results, np.array(all_rows)),
+    )
 
 
 def _describe_edges(results: StudyResults, rows: Float2D) -> list[str]:
@@ -173,23 +213,36 @@ def _describe_edges(results: StudyResults, rows: Float2D) -> list[str]:
     return edges
 
 
+@dataclass(frozen=True, slots=True)
+class IndexRow:
+    """Sobol indices of an outcome and a parameter with their intervals."""
+
+    outcome: str
+    parameter: str
+    first: float
+    first_interval: list[float]
+    total: float
+    total_interval: list[float]
+    used_share: float
+
+
 def _list_indices(
     results: StudyResults, sensitivity: dict[str, SensitivityIndices]
-) -> list[dict[str, Any]]:
+) -> list[IndexRow]:
     """Return a row of the page per outcome and parameter."""
     rows = []
     titles = {variable.name: variable.title for variable in results.scalars}
     for name, indices in sensitivity.items():
         for column, parameter in enumerate(results.study.config.parameters):
             rows.append(
-                {
-                    "outcome": titles[name],
-                    "parameter": parameter.name,
-                    "first": float(indices.first[column]),
-                    "first_interval": indices.first_interval[:, column].tolist(),
-                    "total": float(indices.total[column]),
-                    "total_interval": indices.total_interval[:, column].tolist(),
-                    "used_share": indices.used_share,
-                }
+                IndexRow(
+                    titles[name],
+                    parameter.name,
+                    float(indices.first[column]),
+                    indices.first_interval[:, column].tolist(),
+                    float(indices.total[column]),
+                    indices.total_interval[:, column].tolist(),
+                    indices.used_share,
+                )
             )
     return rows

@@ -72,8 +72,8 @@ class StudyResults:
     def stored_flags(self) -> np.ndarray[Any, np.dtype[np.bool_]]:
         """Which cases are stored, (case,)."""
         flags = np.zeros(self.study.config.case_count, dtype=bool)
-        for entry in self.manifest.entries.values():
-            flags[entry["first"] : entry["first"] + entry["cases"]] = True
+        for chunk in self.manifest.chunks.values():
+            flags[chunk.span] = True
         return flags
 
     def read_array(self, name: str) -> FloatND:

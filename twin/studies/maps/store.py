@@ -11,30 +11,44 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
 from table_io.block import Float2D
 from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
 from twin.laws.library import ENTRY_POINT_GROUP as EFFECT_GROUP
+from twin.results.contract import Contract
 from twin.setup.folders import replace_text
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
-from twin.studies.maps.study import Study
+from twin.studies.maps.study import Study, StudyDefinition
 from twin.system.versions import find_version_problem, read_installed_versions
 
 RESULTS_FOLDER, MANIFEST_FILE = "results.zarr", "chunks.jsonl"
-DEFINITION_KEYS = {"study_toml", "profile_toml", "model_toml", "versions"}
-ENTRY_KEYS = {"chunk", "first", "cases", "sha256", "failures"}
 COORDINATE_CHUNK = 100_000  # cases
 DIRECTION_VALUES = {"forward": 1, "backward": -1}
-Json = dict[str, Any]
+
+
+class StoredChunk(Contract):
+    """Line of `chunks.jsonl`: cases from `first` on, and why cases have no result by number."""
+
+    chunk: int
+    first: int
+    cases: int
+    sha256: str
+    failures: dict[int, str]
+
+    @property
+    def span(self) -> slice:
+        """Place of its cases in the arrays."""
+        return slice(self.first, self.first + self.cases)
 
 
 def estimate_bytes_per_case(study: Study, sweep: SweepPlan) -> int:
@@ -72,11 +86,11 @@ def create_store(folder: Path, study: Study, sweep: SweepPlan, values: Float2D) 
             attributes={"units": variable.unit, "long_name": variable.title},
         )
     # Last: a folder with a definition has the whole group.
-    text = json.dumps(make_definition(study), indent=1, sort_keys=True)
+    text = json.dumps(make_definition(study).to_plain(), indent=1, sort_keys=True)
     replace_text(folder / DEFINITION_FILE, text)
 
 
-def _describe_study(study: Study) -> Json:
+def _describe_study(study: Study) -> Mapping[str, object]:
     config = study.config
     names = [parameter.name for parameter in config.parameters]
     return {
@@ -91,7 +105,7 @@ def _describe_study(study: Study) -> Json:
 
 
 def _add_coordinate(
-    group: Any, name: str, values: npt.NDArray[Any], dim: str, attributes: Json
+    group: Any, name: str, values: npt.NDArray[Any], dim: str, attributes: Mapping[str, object]
 ) -> None:
     array = group.create_array(
         name,
@@ -117,34 +131,32 @@ def make_seeds(seed: int, cases: Iterable[int]) -> npt.NDArray[np.uint64]:
         return mixed ^ (mixed >> np.uint64(31))
 
 
-def make_definition(study: Study) -> Json:
+def make_definition(study: Study) -> StudyDefinition:
     """Return what determines every byte of the results, by which a study can be resumed."""
-    return {
-        "study_toml": study.study_toml,
-        "profile_toml": study.profile_toml,
-        "model_toml": study.model_toml,
-        "versions": read_study_versions(),
-    }
+    return StudyDefinition(
+        study_toml=study.study_toml,
+        profile_toml=study.profile_toml,
+        model_toml=study.model_toml,
+        versions=read_study_versions(),
+    )
 
 
-def read_definition(folder: Path) -> Json:
+def read_definition(folder: Path) -> StudyDefinition:
     """Read the definition of a study; InputError if the folder has none."""
+    path = folder / DEFINITION_FILE
     try:
-        definition: Json = json.loads((folder / DEFINITION_FILE).read_text(encoding="utf-8"))
+        return StudyDefinition.model_validate_json(path.read_bytes(), extra="ignore")
     except OSError:
-        definition = {}
-    except ValueError as error:
-        raise _make_damage_error(folder / DEFINITION_FILE, str(error)) from None
-    if not definition:
         raise InputError(
             "no study", where=folder, allowed="a folder in which `shaketwin map` has started one"
-        )
-    if missing := DEFINITION_KEYS - definition.keys():
-        raise _make_damage_error(folder / DEFINITION_FILE, f"lacks {', '.join(sorted(missing))}")
-    return definition
+        ) from None
+    except ValidationError as error:
+        raise _make_damage_error(path, error) from None
 
 
-def _make_damage_error(path: Path, problem: str) -> InputError:
+def _make_damage_error(path: Path, error: ValidationError, place: str = "") -> InputError:
+    first = error.errors()[0]
+    problem = ": ".join(filter(None, (place, ".".join(map(str, first["loc"])), first["msg"])))
     return InputError(
         f"damaged: {problem}", where=path, remedy="restore it, or start a new study elsewhere"
     )
@@ -168,19 +180,19 @@ def read_study_versions() -> dict[str, str]:
 def require_same_study(folder: Path, study: Study) -> None:
     """Raise InputError unless the study in a folder is this one, of the same versions."""
     stored, new = read_definition(folder), make_definition(study)
-    for key, name in (
-        ("study_toml", "study file"),
-        ("profile_toml", "test"),
-        ("model_toml", "model"),
+    for name, was, now in (
+        ("study file", stored.study_toml, new.study_toml),
+        ("test", stored.profile_toml, new.profile_toml),
+        ("model", stored.model_toml, new.model_toml),
     ):
-        if stored[key] != new[key]:
+        if was != now:
             raise InputError(
                 f"the {name} has changed since the study was started",
                 where=folder,
                 key="--resume",
                 remedy="restore it, or start a new study in another folder",
             )
-    problem = find_version_problem(stored["versions"], new["versions"])
+    problem = find_version_problem(stored.versions, new.versions)
     if problem:
         raise InputError(
             f"the study was started with other versions: {problem}",
@@ -224,68 +236,65 @@ class Manifest:
     def __init__(self, folder: Path, names: Iterable[str] = ()) -> None:
         """`names`: the variables of the study, in the order of the hash."""
         self._path, self._names = folder / MANIFEST_FILE, tuple(names)
-        self.entries = {entry["chunk"]: entry for entry in self._read_lines()}
+        self.chunks = {chunk.chunk: chunk for chunk in self._read_lines()}
 
-    def _read_lines(self) -> list[Json]:
+    def _read_lines(self) -> Iterator[StoredChunk]:
         if not self._path.exists():
-            return []
-        entries = []
+            return
         text = self._path.read_text(encoding="utf-8", errors="replace")
         for number, line in enumerate(text.splitlines(keepends=True), 1):
             if not line.endswith("\n"):  # the process died while it wrote it
                 continue
             try:
-                entry = json.loads(line)
-                problem = ", ".join(sorted(ENTRY_KEYS - entry.keys()))
-            except (ValueError, AttributeError) as error:
-                problem = str(error)
-            if problem:
-                raise _make_damage_error(self._path, f"line {number}: {problem}")
-            entries.append(entry)
-        return entries
+                yield StoredChunk.model_validate_json(line, extra="ignore")
+            except ValidationError as error:
+                raise _make_damage_error(self._path, error, f"line {number}") from None
 
     def start(self, group: Any) -> None:
         """Drop a line that was cut, and those whose chunks are not what was stored.
 
         After a loss of power the lines may be on the disk without their chunks.
         """
-        self.entries = {
-            number: entry
-            for number, entry in self.entries.items()
-            if entry["sha256"] == self._hash_chunk(group, entry)
+        self.chunks = {
+            number: chunk
+            for number, chunk in self.chunks.items()
+            if chunk.sha256 == self._hash_chunk(group, chunk)
         }
-        self._rewrite(self.entries.values())
+        self._rewrite(self.chunks.values())
 
-    def _hash_chunk(self, group: Any, entry: Json) -> str:
+    def _hash_chunk(self, group: Any, chunk: StoredChunk) -> str:
         """Return the hash of a chunk as it is on the disk; "" if it cannot be read."""
-        span = slice(entry["first"], entry["first"] + entry["cases"])
         try:
-            return hash_arrays({name: group[name][span] for name in self._names})
+            return hash_arrays({name: group[name][chunk.span] for name in self._names})
         except (OSError, ValueError, RuntimeError):
             return ""
 
-    def add(self, entry: Json) -> None:
+    def add(self, chunk: StoredChunk) -> None:
         """Add the line of a stored chunk; the line is on the disk when this returns."""
         with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
+            file.write(_format_line(chunk))
             file.flush()
             os.fsync(file.fileno())
-        self.entries[entry["chunk"]] = entry
+        self.chunks[chunk.chunk] = chunk
 
     def finish(self) -> None:
         """Sort the lines by chunk: the file of a finished study does not depend on the workers."""
-        self._rewrite(self.entries[chunk] for chunk in sorted(self.entries))
+        self._rewrite(self.chunks[number] for number in sorted(self.chunks))
 
-    def _rewrite(self, entries: Iterable[Json]) -> None:
-        replace_text(self._path, "".join(json.dumps(entry) + "\n" for entry in entries))
+    def _rewrite(self, chunks: Iterable[StoredChunk]) -> None:
+        replace_text(self._path, "".join(map(_format_line, chunks)))
 
     @property
     def case_count(self) -> int:
         """Number of stored cases."""
-        return sum(entry["cases"] for entry in self.entries.values())
+        return sum(chunk.cases for chunk in self.chunks.values())
 
     @property
     def failures(self) -> dict[int, str]:
         """Reasons of the cases without a result, by their numbers."""
-        failures = [entry["failures"] for entry in self.entries.values()]
-        return {int(case): reason for own in failures for case, reason in own.items()}
+        chunks = self.chunks.values()
+        return {case: reason for chunk in chunks for case, reason in chunk.failures.items()}
+
+
+def _format_line(chunk: StoredChunk) -> str:
+    return json.dumps(chunk.to_plain()) + "\n"

@@ -1,6 +1,6 @@
 """A study with all that it names: test, model, outcomes; checked before anything is computed."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,12 +15,22 @@ from table_io.errors import InputError, suggest
 from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.stepped_sine import validate_frequencies
+from twin.results.contract import Contract
 from twin.setup.run_config import read_model
 from twin.studies.maps.branch_outcomes import BRANCH_OUTCOMES
 from twin.studies.maps.cases import CaseFactory, SampledCase
 from twin.studies.maps.config import StudyConfig
 from twin.studies.maps.outcomes import CURVE_DIMS, ENTRY_POINT_GROUP, Outcome, OutcomeVariable
 from twin.studies.maps.sweep_outcomes import SWEEP_OUTCOMES
+
+
+class StudyDefinition(Contract):
+    """What determines every byte of the results, by which a study can be resumed."""
+
+    study_toml: str
+    profile_toml: str
+    model_toml: str
+    versions: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -52,15 +62,13 @@ class Study:
         return study
 
     @classmethod
-    def from_definition(cls, texts: Mapping[str, str], source: str) -> "Study":
+    def from_definition(cls, definition: StudyDefinition, source: str) -> "Study":
         """Return the study of the TOML texts of study, test and model; errors name `source`."""
-        study_toml, profile_toml, model_toml = (
-            texts[f"{name}_toml"] for name in ("study", "profile", "model")
-        )
-        config = parse_toml(study_toml, StudyConfig, source)
-        profile = parse_toml(profile_toml, Profile, f"{source}: profile")
-        model_config = parse_toml(model_toml, ModelConfig, f"{source}: model")
-        study = cls(config, profile, model_config, study_toml, profile_toml, model_toml)
+        texts = definition.study_toml, definition.profile_toml, definition.model_toml
+        config = parse_toml(definition.study_toml, StudyConfig, source)
+        profile = parse_toml(definition.profile_toml, Profile, f"{source}: profile")
+        model_config = parse_toml(definition.model_toml, ModelConfig, f"{source}: model")
+        study = cls(config, profile, model_config, *texts)
         study.check_cases(source)
         return study
 

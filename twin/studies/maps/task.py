@@ -18,8 +18,8 @@ from twin.studies.maps.compute import compute_chunk, compute_outcomes, make_swee
 from twin.studies.maps.page import write_map_page
 from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.store import (
-    Json,
     Manifest,
+    StoredChunk,
     create_store,
     estimate_bytes_per_case,
     make_seeds,
@@ -199,15 +199,15 @@ def _run_chunks(
             remedy="remove the cause and continue with --resume",
         )
 
-    def keep(number: int, entry: Json) -> int:
-        if reason := entry.get("error", ""):
-            raise describe_failure(number, reason)
-        manifest.add(entry)
-        return int(entry["cases"])
+    def keep(number: int, chunk: StoredChunk | str) -> int:
+        if isinstance(chunk, str):
+            raise describe_failure(number, chunk)
+        manifest.add(chunk)
+        return chunk.cases
 
     run_grid(
         partial(compute_chunk, shared),
-        [n for n in range(study.config.chunk_count) if n not in manifest.entries],
+        [n for n in range(study.config.chunk_count) if n not in manifest.chunks],
         workers, keep, watch, unit="cases", total=study.config.case_count,
         done=manifest.case_count, describe_failure=describe_failure, max_task_s=MAX_CHUNK_S,
         find_problem=partial(find_sharing_problem, shared / DEFINITION_FILE, definition),
