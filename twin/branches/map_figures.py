@@ -5,7 +5,6 @@ acceleration.
 """
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -19,12 +18,13 @@ from twin.drawing.plot_style import (
     GUIDE_COLOUR,
     CaptionedFigure,
     CaptionedFigures,
+    LineStyle,
     Picture,
     save_figures,
 )
 from twin.dynamics.main_branches import ResonanceMap
 
-LOCUS_STYLES: dict[str, dict[str, Any]] = {
+LOCUS_STYLES: dict[str, LineStyle] = {
     "fold": {"color": "#c4161c", "lw": 1.6},
     "grazing": {"color": "#111111", "lw": 1.0, "ls": (0, (4, 2.2))},
 }

@@ -4,7 +4,6 @@ Measured data have the color of the direction, the fitted law or the model is bl
 """
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -32,6 +31,7 @@ from twin.drawing.plot_style import (
     TWIN_COLOUR,
     CaptionedFigure,
     CaptionedFigures,
+    LineStyle,
 )
 
 SIDES = ("right", "left")  # of residual rows 1 and 2
@@ -148,7 +148,7 @@ def _draw_damper(
     ]
     cycle = 2 * np.pi * residuals.scale.time_s / residuals.scale.sample_s
     # lines between few samples of a cycle would draw a polygon
-    law_style: dict[str, Any] = (
+    law_style: LineStyle = (
         {"lw": 0.8} if cycle > MIN_CYCLE_SAMPLES else {"ls": "", "marker": ".", "ms": 1.4, "mew": 0}
     )
     figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.2 * len(close_ups) + 0.6))
@@ -243,7 +243,7 @@ def draw_force_histories(view: DiscoveryView) -> CaptionedFigures:
                 residuals, row, fitted.held_out[view.worst_log], fitted.fit.parameters
             )
             ax.plot(t, measured[row][k], color=DIRECTION_COLOURS[close_up.direction], lw=2.2)
-            model: dict[str, Any] = {"color": TWIN_COLOUR, "lw": 0.9}
+            model: LineStyle = {"color": TWIN_COLOUR, "lw": 0.9}
             ax.plot(t, (measured[row] - error)[k], **model)
             ax.set_ylabel(f"{FORCE_NAMES[row]} in N" if column == 0 else "")
         axes[0, column].set_title(f"{title}, {close_up.title}")

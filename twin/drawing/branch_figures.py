@@ -19,6 +19,7 @@ from twin.drawing.plot_style import (
     GUIDE_COLOUR,
     CaptionedFigure,
     CaptionedFigures,
+    LineStyle,
     Picture,
     save_figures,
 )
@@ -29,7 +30,7 @@ PERIOD_COLOURS = {
 }  # fmt: skip
 LONG_PERIOD_COLOUR = "#6b7480"
 CHAOS_COLOUR = "#f3d9e6"
-BIFURCATION_MARKERS: dict[str, dict[str, Any]] = {
+BIFURCATION_MARKERS: dict[str, LineStyle] = {
     "fold": {"marker": "s", "mfc": "#c4161c"},
     "period doubling": {"marker": "^", "mfc": "#1559b0"},
     "pitchfork": {"marker": "D", "mfc": "#2e9e5b"},
@@ -75,7 +76,7 @@ def plot_branches(
         colour = period_colour(branch.points[0].orbit.periods)
         for first, last, stable in split_by_stability(branch.stable.tolist()):
             piece = slice(first, last + 1)
-            style: dict[str, Any] = {"ls": "-", "lw": 1.5} if stable else {"ls": (0, (4, 2.2))}
+            style: LineStyle = {"ls": "-", "lw": 1.5} if stable else {"ls": (0, (4, 2.2))}
             ax.plot(x[piece], y[piece], color=colour, **style)
         for bifurcation in branch.bifurcations:
             marker = BIFURCATION_MARKERS[bifurcation.kind]
@@ -149,7 +150,7 @@ def _draw_multipliers(branches: BranchSet) -> CaptionedFigures:
         y = np.array([abs(point.orbit.multipliers[0]) for point in branch.points])
         colour = period_colour(branch.points[0].orbit.periods)
         for first, last, stable in split_by_stability(branch.stable.tolist()):
-            style: dict[str, Any] = {"ls": "-", "lw": 1.5} if stable else {"ls": (0, (4, 2.2))}
+            style: LineStyle = {"ls": "-", "lw": 1.5} if stable else {"ls": (0, (4, 2.2))}
             ax.semilogy(x[first : last + 1], y[first : last + 1], color=colour, **style)
     ax.set_xlabel(branches.axis.label)
     ax.set_ylabel("largest Floquet multiplier")

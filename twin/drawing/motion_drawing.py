@@ -7,7 +7,10 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from table_io.block import Float1D
-from twin.drawing.plot_style import REST_LINE_STYLE
+from twin.drawing.plot_style import (
+    REST_LINE_STYLE,
+    LineStyle,
+)
 from twin.results.players import SystemMotion
 
 
@@ -29,7 +32,7 @@ def plot_bumper_loops(ax: Axes, motion: SystemMotion, closed: bool = False, **st
         _plot_loop(ax, position * 1e3, force / 1e3, closed, style)
 
 
-def _plot_loop(ax: Axes, x: Float1D, y: Float1D, closed: bool, style: dict[str, Any]) -> None:
+def _plot_loop(ax: Axes, x: Float1D, y: Float1D, closed: bool, style: LineStyle) -> None:
     ax.plot(*((np.append(x, x[0]), np.append(y, y[0])) if closed else (x, y)), **style)
 
 

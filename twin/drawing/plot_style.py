@@ -35,6 +35,7 @@ DARK_RC_PARAMS: dict[Any, Any] = {
     "text.color": "#e6e6e6", "axes.labelcolor": "#e6e6e6", "axes.edgecolor": "#9a9a9a",
     "xtick.color": "#c8c8c8", "ytick.color": "#c8c8c8", "grid.color": "#33363d",
 }  # fmt: skip
+LineStyle = dict[str, Any]  # keywords of a matplotlib line
 DIRECTION_COLOURS = {"forward": "#c4161c", "backward": "#1559b0"}
 SIDE_COLOURS = {"right": "#c4161c", "left": "#1559b0"}
 DIRECTION_DASHES: dict[str, Any] = {"forward": "-", "backward": (0, (4, 1.8))}
@@ -49,11 +50,10 @@ GAP_COLOURS = {
 TRANSITION_COLOURS = {
     "G4": "#111111", "G0": "#c4161c", "G-1": "#1559b0", "G-2": "#8fcf4a", "G-10": "#1b6e35",
 }  # fmt: skip
-REST_LINE_STYLE: dict[str, Any] = {"color": GUIDE_COLOUR, "ls": (0, (5, 3)), "lw": 0.8}
-UNSTABLE_STYLE: dict[str, Any] = {"color": "#777777", "ls": (0, (1, 1.4)), "lw": 1.1}
+REST_LINE_STYLE: LineStyle = {"color": GUIDE_COLOUR, "ls": (0, (5, 3)), "lw": 0.8}
+UNSTABLE_STYLE: LineStyle = {"color": "#777777", "ls": (0, (1, 1.4)), "lw": 1.1}
 MEASURED_ALPHA = 0.45
 PNG_OPTIONS = {"compress_level": 3}  # 6 takes twice the time for a twentieth of the size
-LineStyle = dict[str, Any]
 DirectionStyle = Callable[[str], LineStyle]  # line style of a direction
 
 

@@ -5,7 +5,6 @@ curves and line styles only.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -144,7 +143,7 @@ def draw_jumps(
                     continue
                 x, (start, stop) = (jump.from_hz + jump.to_hz) / 2, (sign * end[0] for end in ends)
                 colour = DIRECTION_COLOURS[jump.direction]
-                style: dict[str, Any] = {"arrowstyle": "-|>", "color": colour, "lw": 1.6}
+                style: LineStyle = {"arrowstyle": "-|>", "color": colour, "lw": 1.6}
                 style |= {"shrinkA": 0, "shrinkB": 0}
                 ax.annotate("", (x, stop), (x, start), arrowprops=style, zorder=4)
                 if name == label_in:

@@ -1,7 +1,6 @@
 """Force-displacement loops in primary resonance (Figs. 3, 6, 8) and time histories (Fig. 7)."""
 
 from dataclasses import dataclass
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,6 +20,7 @@ from twin.drawing.plot_style import (
     UNSTABLE_STYLE,
     CaptionedFigure,
     CaptionedFigures,
+    LineStyle,
     direction_handles,
     experiment_style,
     format_minus,
@@ -113,7 +113,7 @@ def _draw_gap_comparison(study: PaperStudy) -> CaptionedFigure:
         index, direction = study.slow_sweeps[name].peak
         hz = float(study.slow_sweeps[name].frequency[index])
         motion = simulate_steady_motion(study, name, hz, direction, 1)
-        style: dict[str, Any] = {"color": GAP_COLOURS[name], "lw": 1.4}
+        style: LineStyle = {"color": GAP_COLOURS[name], "lw": 1.4}
         for ax in (mass_ax, insets[0]):
             plot_inertia_loop(ax, motion, case.parameters.mass, True, **style)
         for ax in (bumper_ax, insets[1]):

@@ -145,7 +145,7 @@ def _equalize_scales(axes: Any) -> None:
 
 
 def _plot_motion(
-    column: Any, row: int, motion: SystemMotion, case: PaperCase, style: dict[str, Any]
+    column: Any, row: int, motion: SystemMotion, case: PaperCase, style: LineStyle
 ) -> None:
     plot_phase_portrait(column[row], motion, **style)
     plot_inertia_loop(column[2 + row], motion, case.parameters.mass, **style)

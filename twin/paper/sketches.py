@@ -1,7 +1,5 @@
 """Sketches: position and deformation of a bumper (Fig. 4), the numerical model (Fig. 10)."""
 
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -13,6 +11,7 @@ from twin.drawing.plot_style import (
     SIDE_COLOURS,
     CaptionedFigure,
     CaptionedFigures,
+    LineStyle,
     label_panel,
 )
 from twin.paper.study import PaperStudy
@@ -115,7 +114,7 @@ def _hide_axes(ax: Axes, x_limits: tuple[float, float], y_limits: tuple[float, f
     ax.axis("off")
 
 
-def _arrow(style: str, colour: str) -> dict[str, Any]:
+def _arrow(style: str, colour: str) -> LineStyle:
     return {"arrowstyle": style, "color": colour, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
 
 
@@ -156,7 +155,7 @@ def _draw_spring(ax: Axes, start: float, stop: float, y: float, colour: str) -> 
 
 def _draw_dashpot(ax: Axes, start: float, stop: float, y: float, colour: str) -> None:
     cup, piston, closed = (start + (stop - start) * share for share in (0.35, 0.55, 0.65))
-    style: dict[str, Any] = {"color": colour, "lw": 1.2}
+    style: LineStyle = {"color": colour, "lw": 1.2}
     height = 0.2
     ax.plot([start, piston], [y, y], **style)
     ax.plot([piston, piston], [y - 0.8 * height, y + 0.8 * height], **{**style, "lw": 2.2})

@@ -2,13 +2,12 @@
 
 import csv
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from rich.table import Table
 
@@ -51,12 +50,34 @@ from twin.system.versions import format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
-Row = dict[str, Any]
 PRC_QUANTITIES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 TABLE_COLUMNS = {
     "u": "nrmse rel_disp_m", "a": "nrmse mass_acc_m_s2", "F_R": "nrmse force_r1_n",
     "F_L": "nrmse force_l1_n", "u free": "free_nrmse rel_disp_m", "PRC eta_d": "prc eta_d",
 }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayRow:
+    """Comparison of one replay; errors as ratios by name, None if not comparable."""
+
+    log: str
+    model: str | None
+    same_model: bool
+    identical: bool | None
+    gaps: int
+    errors: dict[str, float | None]
+    steps: int
+    steps_with_the_same_impacts: int
+    jumps: str
+    twin_jumps: str
+
+    def list_cells(self) -> Mapping[str, object]:
+        """Return the cells of comparison.csv by column, one for each error."""
+        cells: dict[str, object] = {}
+        for name, value in asdict(self).items():
+            cells |= value if name == "errors" else {name: value}
+        return cells
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +215,7 @@ def replay_all(request: ReplayRequest) -> int:
     models, names = request.models or [RECORDED], _name_logs(request.logs)
     _check_replays(request, models, names)
     folder, _ = make_run_folder(request.out, "replays")
-    rows: list[Row] = []
+    rows: list[ReplayRow] = []
     for log, name in zip(request.logs, names, strict=True):
         recorded = open_replay_log(log)
         span = select_span(recorded.recording, request.steps)
@@ -213,14 +234,14 @@ def replay_all(request: ReplayRequest) -> int:
             summary.replay = entry
             summary.write(replay_folder / "summary.json")
             print_line(f"{replay_folder.name}: {format_identity(identity, entry)}")
-            rows.append({"log": name, "model": model, **_make_row(summary, entry)})
+            rows.append(_make_row(name, model, summary, entry))
     _write_comparison(folder, rows)
     print_table(console, _make_table(rows))
     print_line(f"{folder / 'comparison.csv'}, {folder / 'comparison.json'}; a page of one: "
         f"shaketwin report {folder / '<log>-<model>'}")  # fmt: skip
-    if any(row["same_model"] and row["identical"] is False for row in rows):
+    if any(row.same_model and row.identical is False for row in rows):
         return EXIT_NOT_IDENTICAL
-    return EXIT_GAPS if any(row["gaps"] for row in rows) else 0
+    return EXIT_GAPS if any(row.gaps for row in rows) else 0
 
 
 def _check_replays(request: ReplayRequest, models: list[str], names: list[str]) -> None:
@@ -262,27 +283,28 @@ def _name_logs(logs: list[Path]) -> list[str]:
     return names
 
 
-def _make_row(summary: RunSummary, entry: ReplayResult) -> Row:
-    """Return the comparison of one replay; errors as ratios, None if not comparable."""
+def _make_row(log: str, model: str | None, summary: RunSummary, entry: ReplayResult) -> ReplayRow:
+    """Return the comparison of the replay of a log with a model."""
     nrmse = {
         f"{kind} {channel}": getattr(error, kind)
         for channel, error in summary.comparison.items()
         for kind in ("nrmse", "free_nrmse")
     }
     pairs = [(step.measured, step.twin) for step in summary.steps if step.measured and step.twin]
-    return {
-        "same_model": entry.model == RECORDED,
-        "identical": entry.identical,
-        "gaps": summary.gaps,
-        **nrmse,
-        **{f"prc {name}": _prc_error(pairs, name) for name in PRC_QUANTITIES},
-        "steps": len(pairs),
-        "steps_with_the_same_impacts": sum(
+    return ReplayRow(
+        log,
+        model,
+        same_model=entry.model == RECORDED,
+        identical=entry.identical,
+        gaps=summary.gaps,
+        errors=nrmse | {f"prc {name}": _prc_error(pairs, name) for name in PRC_QUANTITIES},
+        steps=len(pairs),
+        steps_with_the_same_impacts=sum(
             _count_impacts(rig) == _count_impacts(twin) for rig, twin in pairs
         ),
-        "jumps": _format_jumps(summary.jumps),
-        "twin_jumps": _format_jumps(summary.twin_jumps),
-    }
+        jumps=_format_jumps(summary.jumps),
+        twin_jumps=_format_jumps(summary.twin_jumps),
+    )
 
 
 def _prc_error(pairs: list[tuple[Response, Response]], name: str) -> float | None:
@@ -305,27 +327,26 @@ def _format_jumps(jumps: list[Jump]) -> str:
     return ", ".join(f"{jump.kind} {jump.from_hz:g}-{jump.to_hz:g} Hz" for jump in jumps)
 
 
-def _write_comparison(folder: Path, rows: list[Row]) -> None:
-    write_json({"replays": rows}, folder / "comparison.json")
-    names = list(dict.fromkeys(name for row in rows for name in row))
+def _write_comparison(folder: Path, rows: list[ReplayRow]) -> None:
+    tables = [row.list_cells() for row in rows]
+    write_json({"replays": tables}, folder / "comparison.json")
+    names = list(dict.fromkeys(name for cells in tables for name in cells))
     with (folder / "comparison.csv").open("x", newline="") as file:
         writer = csv.DictWriter(file, names)
         writer.writeheader()
-        writer.writerows(rows)
+        writer.writerows(tables)
 
 
-def _make_table(rows: list[Row]) -> Table:
+def _make_table(rows: list[ReplayRow]) -> Table:
     """Make the table of NRMSE by channel (u also free-running), PRC error, impacts and jumps."""
     table = Table(title="Replays: error of the twin over the signal, in per cent")
     heads = ("log", "model", *TABLE_COLUMNS, "same impacts", "jumps", "twin's jumps", "bits")
     for head in heads:
         table.add_column(head, justify="right" if head in TABLE_COLUMNS else "left")
     for row in rows:
-        shares = [row.get(key) for key in TABLE_COLUMNS.values()]
+        shares = [row.errors.get(key) for key in TABLE_COLUMNS.values()]
         cells = ["-" if share is None else f"{100 * share:.3g}" for share in shares]
-        same = f"{row['steps_with_the_same_impacts']} of {row['steps']} steps"
-        bits = {True: "identical", False: "differ", None: "-"}[row["identical"]]
-        table.add_row(
-            row["log"], str(row["model"]), *cells, same, row["jumps"], row["twin_jumps"], bits
-        )
+        same = f"{row.steps_with_the_same_impacts} of {row.steps} steps"
+        bits = {True: "identical", False: "differ", None: "-"}[row.identical]
+        table.add_row(row.log, f"{row.model}", *cells, same, row.jumps, row.twin_jumps, bits)
     return table
