@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.builders.rigs import read_rig_text
-from tests.builders.truths import seal_truth
+from tests.builders.rigs import RIG_TEXT
+from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
 from twin import api
 from twin.discovery.command import run_discovery, run_identification
@@ -114,9 +114,7 @@ enabled = false
 @pytest.mark.parametrize("truth", ["", HIDDEN_SPRING])
 def test_discover_and_identify_return_what_the_commands_write(truth: str, tmp_path: Path) -> None:
     """No effect of the library is tried, so that a law is searched for what is hidden."""
-    keys = seal_truth(tmp_path, truth) if truth else {}
-    entries = "".join(f'{key} = "{value}"\n' for key, value in keys.items())
-    (tmp_path / "rig.toml").write_text(f"{read_rig_text('simulated')}{entries}")
+    (tmp_path / "rig.toml").write_text(hide_truth(RIG_TEXT, tmp_path, truth))
     (tmp_path / "test.toml").write_text(TEST)
     log = api.run_simulated(tmp_path / "test.toml", tmp_path / "run").path
     without = [effect.id for effect in EFFECTS]

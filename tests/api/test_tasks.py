@@ -12,6 +12,7 @@ import pytest
 from table_io.config.base import PROFILES_DIR
 from table_io.config.provenance import Provenance
 from table_io.config.toml_text import format_toml
+from tests.builders.rigs import read_model_text
 from tests.command_line import call_main
 from tests.sweeps.small_study import read_stored_bytes, write_study
 from twin import api
@@ -150,7 +151,7 @@ def compare_maps(log: Path, folder: Path) -> tuple[object, object]:
 
 def compare_plans(log: Path, folder: Path) -> tuple[object, object]:
     """Of a test whose model was identified at another mass."""
-    text = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    text = read_model_text("snm")
     provenance = Provenance(masses_kg=(700.0,), gaps_mm=(4.0,))
     (folder / "model.toml").write_text(text + format_toml({"provenance": provenance.model_dump()}))
     profile = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()

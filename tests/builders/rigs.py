@@ -23,6 +23,11 @@ def read_rig(name: str) -> RigConfig:
     return parse_toml(read_rig_text(name), RigConfig, f"{name}.toml")
 
 
+def read_model_text(name: str) -> str:
+    """Return the text of a shipped model file."""
+    return (PROFILES_DIR / "models" / f"{name}.toml").read_text(encoding="utf-8")
+
+
 RIG_TEXT = read_rig_text("simulated")
 RIG = read_rig("simulated")
 CHANNEL_ROWS = {name: row for row, name in enumerate(RIG.channels)}

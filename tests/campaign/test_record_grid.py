@@ -12,6 +12,7 @@ from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.safety.preflight import check_limits, compute_demands
+from tests.builders.rigs import read_model_text
 from tests.campaign.campaigns import Players, make_options, prepare_campaign
 from tests.input_errors import raises_input_error
 from twin.campaign.command import run_campaign
@@ -206,7 +207,7 @@ def test_a_base_that_cannot_be_one_is_refused(tmp_path: Path, old: str, new: str
 
 
 def test_a_rate_too_low_for_the_bumper_is_refused_at_any_gap(tmp_path: Path) -> None:
-    model = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    model = read_model_text("snm")
     assert "bumper_stiffness_n_m = 510000.0" in model
     (tmp_path / "stiff.toml").write_text(model.replace("510000.0", "5.1e8"))
     path = write_grid(tmp_path, base=f'model = "stiff.toml"\n{BASE}')

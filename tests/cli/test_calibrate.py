@@ -21,12 +21,12 @@ from table_io.config.rig_file import load_rig
 from table_io.config.sensor import CalibrationRecord
 from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.rigs import RIG_TEXT
 from tests.input_errors import raises_input_error
 from twin.cli.table import app
 from twin.rig import calibrate as command
 from twin.setup.run_config import read_run_config
 
-TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 LASER = 'channel = "table_disp_m"\nunit = "mm"\n'
 SENSITIVITY, ZERO = 0.1340, 0.2  # V/mm, and in mm what it shows at 0; the card says 2/15 V/mm
 
@@ -58,7 +58,7 @@ Calibrate = Callable[..., tuple[int, str]]
 def calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrate]:
     """`calibrate table_disp_m --table mine.toml ...`; the person applies what the prompt says."""
     (tmp_path / "mine.toml").write_text(
-        TEXT.replace(LASER, LASER + 'serial = "L 7"\nshunt = 5.0\nshunt_tolerance = 0.05\n')
+        RIG_TEXT.replace(LASER, LASER + 'serial = "L 7"\nshunt = 5.0\nshunt_tolerance = 0.05\n')
     )
     monkeypatch.chdir(tmp_path)
 
@@ -109,7 +109,7 @@ def test_two_points_give_sensitivity_offset_and_a_record(
     assert f"volts_per_unit = {record.volts_per_unit!r}" in text
     # what is printed for the card is valid there, and edits nothing by itself
     lines = text[text.index("volts_per_unit = ") :].splitlines()
-    mended = TEXT.replace("volts_per_unit = 0.13333333333333333", "").replace(
+    mended = RIG_TEXT.replace("volts_per_unit = 0.13333333333333333", "").replace(
         "offset = 0.12", "\n".join(lines)
     )
     assert (
@@ -206,7 +206,7 @@ def test_what_cannot_be_is_refused_and_leaves_no_record(
     assert records(tmp_path) == []
 
 
-CARD = parse_toml(TEXT, RigConfig, "card").sensors[2]
+CARD = parse_toml(RIG_TEXT, RigConfig, "card").sensors[2]
 ASKED = command.CalibrationOptions(CARD.channel, "simulated", "0,1")
 
 
@@ -303,7 +303,7 @@ class Inputs:
 
     def tare(self, samples: int) -> Float2D:
         self.calls.append(samples)
-        rig = parse_toml(TEXT, RigConfig, "card")
+        rig = parse_toml(RIG_TEXT, RigConfig, "card")
         rows = [self.volts if name == self.channel else self.volts + 1e3 for name in rig.channels]
         return np.array(rows)
 
@@ -317,7 +317,7 @@ class Inputs:
 def test_one_clipped_sample_is_refused_on_either_side(
     share: float, sign: float, turned: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = parse_toml(TEXT, RigConfig, "card")
+    rig = parse_toml(RIG_TEXT, RigConfig, "card")
     sensor = CARD.model_copy(update={"volts_per_unit": turned * CARD.volts_per_unit})
     volts = np.full(500, 0.1)
     volts[:5] = np.nan

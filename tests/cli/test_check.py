@@ -14,6 +14,7 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
+from tests.builders.rigs import RIG_TEXT, read_model_text
 from tests.command_line import call_main
 from twin.rig.check import check_config, find_worst_rows, print_plan, select_rows, sum_durations_s
 from twin.rig.drive_figure import draw_drive
@@ -21,8 +22,7 @@ from twin.rig.predicted_ranges import format_clipping_warnings, predict_response
 from twin.setup.folders import make_output_folder, remove_empty_folders
 from twin.setup.run_config import RunConfig, from_texts, read_run_config
 
-RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
-SNM = (PROFILES_DIR / "models" / "snm.toml").read_text()
+SNM = read_model_text("snm")
 TEST = """
 title = "Short"
 [specimen]
@@ -37,7 +37,7 @@ measured_cycles = 2
 """
 
 
-def bundle(test: str = TEST, rig: str = RIG) -> RunConfig:
+def bundle(test: str = TEST, rig: str = RIG_TEXT) -> RunConfig:
     return from_texts("short", test, rig, SNM, "short.toml")
 
 
@@ -144,7 +144,7 @@ def test_a_load_cell_bears_half_of_its_side_and_the_preload() -> None:
 
 
 def test_a_sensor_that_the_model_drives_out_of_range_is_warned_of_not_refused() -> None:
-    small = RIG.replace('unit = "g"\nrange = 5.0', 'unit = "g"\nrange = 0.3')
+    small = RIG_TEXT.replace('unit = "g"\nrange = 5.0', 'unit = "g"\nrange = 0.3')
     config = bundle(rig=small)
     (warning,) = format_clipping_warnings(predict_response(config).peaks, config.rig)
     assert warning.startswith("mass_acc_m_s2: ")

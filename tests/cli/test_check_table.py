@@ -20,12 +20,12 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.flight_records import read_flight_record
+from tests.builders.rigs import RIG_TEXT, read_rig_text
 from tests.input_errors import raises_input_error
 from twin.cli.table import app
 from twin.rig.check_table import WiringCheckResult, examine_wiring
 
-TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
-RIG = parse_toml(TEXT, RigConfig, "simulated")
+RIG = parse_toml(RIG_TEXT, RigConfig, "simulated")
 RATE, SPECIMEN = 2000.0, Specimen(mass_kg=550.0, gap_mm=4.0)
 
 
@@ -64,7 +64,7 @@ def examine(backend: Watched, rig: RigConfig = RIG, person: object = False) -> W
 
 
 def plant_faults(*faults: str) -> RigConfig:
-    return parse_toml(TEXT + "\n[[simulated.faults]]\n".join(["", *faults]), RigConfig, "card")
+    return parse_toml(RIG_TEXT + "\n[[simulated.faults]]\n".join(["", *faults]), RigConfig, "card")
 
 
 def failing(result: WiringCheckResult) -> list[tuple[str, str]]:
@@ -295,8 +295,8 @@ def test_a_press_that_is_held_until_the_next_is_asked_for_swaps_nothing() -> Non
 
 def run_shunt_check(size: float) -> WiringCheckResult:
     head = 'channel = "force_r1_n"\nunit = "kN"\n'
-    assert TEXT.count(head) == 1
-    text = TEXT.replace(head, head + "shunt = 2.0\nshunt_tolerance = 0.05\n")
+    assert RIG_TEXT.count(head) == 1
+    text = RIG_TEXT.replace(head, head + "shunt = 2.0\nshunt_tolerance = 0.05\n")
     rig = parse_toml(text, RigConfig, "card")
 
     class Switched(Struck):
@@ -344,7 +344,7 @@ def test_the_command_says_it_in_a_table_and_ends_with_2_where_a_line_fails(
     assert "no line fails" in text
     assert text.rstrip().endswith("nothing was moved")
     fault = '\n[[simulated.faults]]\nkind = "cable_off"\nchannel = "mass_disp_m"\nat_s = 0.0\n'
-    due = TEXT.replace('channel = "force_l2_n"', 'channel = "force_l2_n"\ndue = 2020-01-01')
+    due = RIG_TEXT.replace('channel = "force_l2_n"', 'channel = "force_l2_n"\ndue = 2020-01-01')
     (tmp_path / "card.toml").write_text(due + fault)
     code, text = invoke("--table", "card.toml")
     assert code == 2
@@ -395,7 +395,7 @@ def free_port(kind: int) -> int:
 def test_on_a_table_of_its_own_every_line_passes_and_its_black_box_saw_no_motion(
     name: str, tmp_path: Path
 ) -> None:
-    text = (PROFILES_DIR / "rigs" / f"{name}.toml").read_text(encoding="utf-8")
+    text = read_rig_text(name)
     port = free_port(socket.SOCK_DGRAM if name == "udp_simulated" else socket.SOCK_STREAM)
     card, box = tmp_path / "card.toml", tmp_path / "box"
     lines = '\nheartbeat_back = "Dev1/port0/line1"\nwell = { limit = "Dev1/port0/line2" }\n'

@@ -1,6 +1,5 @@
 """`discover --decide`: the proposal, the rig that plays it or refuses, the operator, the chain."""
 
-import hashlib
 import json
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
@@ -9,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
 from table_io.errors import InputError
+from tests.builders.rigs import RIG_TEXT
+from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
 from twin.discovery import command, decide, decisive_test
 from twin.discovery.command import parse_options, run_decision, run_discovery
@@ -52,12 +52,7 @@ OTHERS = [effect.id for effect in EFFECTS if effect.id not in KEPT]  # left out:
 def record_run(folder: Path, truth: str = "") -> Path:
     """A recording of one frequency at one level, on a rig that may hide an effect."""
     folder.mkdir(parents=True)
-    text = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
-    if truth:
-        (folder / "truth.toml").write_text(truth)
-        digest = hashlib.sha256(truth.encode()).hexdigest()
-        text += f'truth = "{folder / "truth.toml"}"\ntruth_sha256 = "{digest}"\n'
-    (folder / "rig.toml").write_text(text)
+    (folder / "rig.toml").write_text(hide_truth(RIG_TEXT, folder, truth))
     profile, log = folder / "p.toml", folder / "first.mcap"
     profile.write_text(PROFILE.format(rig=folder / "rig.toml"))
     play_unpaced(read_run_config(profile), "first", log, lambda: None, lambda item: None)

@@ -21,13 +21,13 @@ from table_io.backends.ni import driver as ni_found
 from table_io.backends.opendaq import source as daq_found
 from table_io.backends.opendaq.source import discover_devices as discover_opendaq_devices
 from table_io.config import folders
-from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from tests.builders.rigs import read_rig_text
 from tests.input_errors import raises_input_error
 from twin.cli.table import app
 from twin.rig import devices as command
 
-MACHINE = (PROFILES_DIR / "rigs" / "machine.toml").read_text(encoding="utf-8")
+MACHINE = read_rig_text("machine")
 LASER = DiscoveredDevice(
     "opendaq", "daq.nd://lab", "discovery", "Maker X1", "S1", False,
     (ChannelGroup("AI", ("Sig/AI0", "Sig/AI1"), ((-10.0, 10.0), (-5.0, 5.0)), 1e5),),
@@ -41,7 +41,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     rigs = tmp_path / "shipped" / "rigs"
     rigs.mkdir(parents=True)
     for name in ("simulated", "machine"):
-        (rigs / f"{name}.toml").write_text((PROFILES_DIR / "rigs" / f"{name}.toml").read_text())
+        (rigs / f"{name}.toml").write_text(read_rig_text(name))
     monkeypatch.setattr(folders, "PROFILES_DIR", tmp_path / "shipped")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(daq_found, "discover_devices", lambda addresses: (LASER,))

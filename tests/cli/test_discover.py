@@ -1,6 +1,5 @@
 """Recordings that nothing should be learned from, and what a user is told of them."""
 
-import hashlib
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,9 +9,10 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D
-from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.records import SampleGap
+from tests.builders.rigs import RIG_TEXT, read_model_text
+from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
 from twin.discovery import task
 from twin.discovery.build_verdict import REFITTED_SUFFIX
@@ -66,17 +66,10 @@ def record_run(
     folder: Path, truth: str = "", gap: str = "4.0", laser_range_mm: float = 100.0
 ) -> Made:
     folder.mkdir()
-    rig, text = folder / "rig.toml", (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
-    text = text.replace(
-        'channel = "mass_disp_m"\nunit = "mm"\nrange = 100.0',
-        f'channel = "mass_disp_m"\nunit = "mm"\nrange = {laser_range_mm}',
-    )
-    if truth:
-        sealed = folder / "truth.toml"
-        sealed.write_text(truth)
-        digest = hashlib.sha256(truth.encode()).hexdigest()
-        text += f'truth = "{sealed}"\ntruth_sha256 = "{digest}"\n'
-    rig.write_text(text)
+    laser = 'channel = "mass_disp_m"\nunit = "mm"\nrange = '
+    text = RIG_TEXT.replace(f"{laser}100.0", f"{laser}{laser_range_mm}")
+    rig = folder / "rig.toml"
+    rig.write_text(hide_truth(text, folder, truth))
     profile, log = folder / "p.toml", folder / f"{folder.name}.mcap"
     profile.write_text(PROFILE.format(rig=rig, gap=gap))
     play_unpaced(read_run_config(profile), folder.name, log, lambda: None, lambda item: None)
@@ -198,7 +191,7 @@ def test_agreement_with_other_parameters_is_not_agreement(tmp_path: Path) -> Non
 
 
 def test_an_effect_of_the_model_that_is_not_there_is_said(plain: Made, tmp_path: Path) -> None:
-    text = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    text = read_model_text("snm")
     model = tmp_path / "more.toml"
     model.write_text(f'{text}[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = 4e7 }}\n')
     verdict = discover_from([plain.log], str(model)).verdict

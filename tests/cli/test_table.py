@@ -17,12 +17,13 @@ from table_io.config.profile import Specimen
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from tests.builders.flight_records import read_flight_record
+from tests.builders.rigs import read_rig_text
 from tests.input_errors import raises_input_error
 from twin.live.run_command import run_test
 from twin.rig.table import serve_table
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
-CARD = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
+CARD = read_rig_text("machine")
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
 
 

@@ -1,7 +1,6 @@
 """The watch on real sessions of the simulated table: silent where the model is right, clear where
 something was planted; and each of its parts alone where a session would not show it."""
 
-import hashlib
 import math
 import re
 from collections.abc import Sequence
@@ -30,6 +29,8 @@ from table_io.records import (
     Record,
     Step,
 )
+from tests.builders.rigs import RIG_TEXT, read_model_text
+from tests.builders.truths import hide_truth
 from twin.compare import COMPARED_CHANNELS, pipeline
 from twin.compare.monitoring import EVENT_KINDS, jumps
 from twin.compare.monitoring.attractor_change import AttractorState, detect_attractor_change
@@ -74,17 +75,8 @@ STEP_HZ = 0.1  # of the sweeps of points
 def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
     """(the bundle that a person knows of, every measured sample of the rig with that truth)."""
     with TemporaryDirectory() as folder:
-        rig = (PROFILES_DIR / "rigs/simulated.toml").read_text()
-        sealed = Path(folder) / "truth.toml"
-        sealed.write_text(truth)
-        sealed_lines = (
-            f'truth = "{sealed}"\ntruth_sha256 = "{hashlib.sha256(truth.encode()).hexdigest()}"'
-        )
-        if truth:
-            rig = rig.replace("[simulated]", f"[simulated]\n{sealed_lines}")
-        bundle = from_texts(
-            "x", PROFILE.format(gap=gap), rig, (PROFILES_DIR / "models/snm.toml").read_text(), "x"
-        )
+        rig = hide_truth(RIG_TEXT, Path(folder), truth)
+        bundle = from_texts("x", PROFILE.format(gap=gap), rig, read_model_text("snm"), "x")
         clock = ManualClock()
         backend = open_backend(bundle.rig, bundle.profile, clock)
         items = run_session(
@@ -100,11 +92,24 @@ def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
 @cache
 def monitor_session(truth: str = "", gap: float = 4.0) -> tuple[Record, ...]:
     """What the twin says about such a session."""
-    bundle, measured = session(truth, gap)
+    return run_twin(*session(truth, gap))
+
+
+def run_twin(bundle: RunConfig, measured: Block) -> tuple[Record, ...]:
+    """Everything that the twin of a configuration says about samples, but its predictions."""
     setup = bundle.prepare_twin()
     state, _ = pipeline.start_pipeline(setup)
     _, items = pipeline.step(setup, state, measured)
     return tuple(item for item in items if not isinstance(item, Block))
+
+
+def change_channels(measured: Block, names: Sequence[str], samples: slice, value: float) -> Block:
+    """Return the samples with another value in some of some channels."""
+    values = measured.values.copy()
+    for name in names:
+        if name in measured.channels:
+            values[measured.channels.index(name), samples] = value
+    return replace(measured, values=values)
 
 
 def warnings(items: Sequence[Record], *but: str) -> list[Event]:
@@ -461,12 +466,8 @@ def test_what_the_model_has_is_not_found_again(truth: str, expected: dict[str, f
     effect_tables = re.sub(
         r'channel = ("\w+")\nparameters = \{', r"parameters = { channel = \1,", text
     )
-    card = (PROFILES_DIR / "models/snm.toml").read_text() + "\n" + effect_tables
-    same = from_texts("x", bundle.profile_toml, bundle.rig_toml, card, "x")
-    setup = same.prepare_twin()
-    state, _ = pipeline.start_pipeline(setup)
-    _, made = pipeline.step(setup, state, measured)
-    items = [item for item in made if not isinstance(item, Block)]
+    card = read_model_text("snm") + "\n" + effect_tables
+    items = run_twin(from_texts("x", bundle.profile_toml, bundle.rig_toml, card, "x"), measured)
     for name, value in expected.items():
         estimate, sd, *_ = estimates(items, name)[-1]
         assert abs(estimate - value) < 0.02 * value + 5 * sd, (name, estimate)
@@ -477,24 +478,14 @@ def test_a_bumper_where_none_should_be_is_no_crash() -> None:
     """The wrong set: the profile's gap is never reached, and the cells feel contact."""
     _, measured = session()
     bundle, _ = session("", 30.0)
-    setup = bundle.prepare_twin()
-    state, _ = pipeline.start_pipeline(setup)
-    _, made = pipeline.step(setup, state, measured)
-    assert "disagreement" in {item.kind for item in made if isinstance(item, Event)}
+    assert "disagreement" in {event.kind for event in warnings(run_twin(bundle, measured))}
 
 
 def test_cells_that_read_nothing_in_contact_are_beyond_their_band() -> None:
     bundle, measured = session()
-    values = measured.values.copy()
-    for name in ("force_r1_n", "force_r2_n"):
-        values[measured.channels.index(name)] = 0.0
-    labels = measured.step, measured.label, measured.cycle
-    block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
-    setup = bundle.prepare_twin()
-    state, _ = pipeline.start_pipeline(setup)
-    _, made = pipeline.step(setup, state, block)
+    dead = change_channels(measured, ("force_r1_n", "force_r2_n"), slice(None), 0.0)
     disagreements = [
-        item for item in made if isinstance(item, Event) and item.kind == "disagreement"
+        event for event in warnings(run_twin(bundle, dead)) if event.kind == "disagreement"
     ]
     assert disagreements
     assert "force_r" in disagreements[0].text
@@ -506,15 +497,9 @@ def test_a_lost_sample_now_and_then_hides_no_disagreement_and_repeats_none() -> 
     whole = [
         warning for warning in warnings(monitor_session(truth)) if warning.kind == "disagreement"
     ]
-    values = measured.values.copy()
-    values[measured.channels.index("mass_disp_m"), ::1000] = np.nan
-    labels = measured.step, measured.label, measured.cycle
-    block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
-    setup = bundle.prepare_twin()
-    state, _ = pipeline.start_pipeline(setup)
-    _, made = pipeline.step(setup, state, block)
+    holed = change_channels(measured, ("mass_disp_m",), slice(None, None, 1000), math.nan)
     disagreements = [
-        item for item in made if isinstance(item, Event) and item.kind == "disagreement"
+        event for event in warnings(run_twin(bundle, holed)) if event.kind == "disagreement"
     ]
     assert 1 <= len(disagreements) <= len(whole) + 1
 
@@ -552,16 +537,7 @@ def test_noise_is_that_of_the_first_samples_at_rest_however_they_are_cut(samples
 def test_without_sensors_it_says_less_and_nothing_wrong() -> None:
     """Each channel lost in turn, and all load cells: no warning appears that was not there."""
     bundle, measured = session()
-    setup = bundle.prepare_twin()
     cells = tuple(name for name in measured.channels if name.startswith("force"))
     for lost in (("mass_acc_m_s2",), ("table_disp_m",), cells, COMPARED_CHANNELS):
-        values = measured.values.copy()
-        for name in lost:
-            if name in measured.channels:
-                values[measured.channels.index(name)] = np.nan
-        labels = measured.step, measured.label, measured.cycle
-        block = Block("meas", 0, measured.rate_hz, measured.channels, values, *labels)
-        state, _ = pipeline.start_pipeline(setup)
-        _, items = pipeline.step(setup, state, block)
-        records = [item for item in items if not isinstance(item, Block)]
+        records = run_twin(bundle, change_channels(measured, lost, slice(None), math.nan))
         assert {event.kind for event in warnings(records)} <= {"jump"}, lost

@@ -1,6 +1,5 @@
 """Short recordings of the simulated table, with something hidden in it, made ready for learning."""
 
-import hashlib
 import tempfile
 from dataclasses import replace
 from functools import cache
@@ -11,17 +10,16 @@ from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.records import RunStart
 from table_io.sim.config import SimulatedTableConfig
+from tests.builders.rigs import RIG
+from tests.builders.truths import seal_truth
 from twin.discovery.discover import PreparedLog
 from twin.discovery.signals import LogSignals, build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TRUE = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
 SNM = Model(TRUE)
 CELL_SHARE = 0.52  # of the right force in its first cell, and of the left one in its second
@@ -53,11 +51,7 @@ def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Bl
     assert simulated is not None
     with tempfile.TemporaryDirectory() as folder:
         if truth:
-            path = Path(folder) / "truth.toml"
-            path.write_text(truth)
-            sealed = hashlib.sha256(truth.encode()).hexdigest()
-            update = {"truth": str(path), "truth_sha256": sealed}
-            simulated = simulated.model_copy(update=update)
+            simulated = simulated.model_copy(update=seal_truth(Path(folder), truth))
         rig = RIG.model_copy(update={"sensors": tuple(sensors), "simulated": simulated})
         clock, test = ManualClock(), profile(gap_mm)
 

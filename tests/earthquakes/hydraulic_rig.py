@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Specimen
-from table_io.config.rig import RigConfig
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
+from tests.builders.rigs import read_rig
 
 RATE_HZ = 1000.0
-RIG = load_config(PROFILES_DIR / "rigs" / "hydraulic.toml", RigConfig, "rig")[0]
+RIG = read_rig("hydraulic")
 TABLE = RIG.require_section("simulated", SimulatedTableConfig)
 SPECIMEN_KG = 550.0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.excitation import History
 from table_io.config.profile import Specimen, load_profile
 from table_io.config.provenance import HashedFile, Provenance
@@ -15,6 +15,7 @@ from table_io.config.rig import RigConfig
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import list_setup_warnings
+from tests.builders.rigs import read_model_text, read_rig_text
 from tests.command_line import call_main
 from tests.earthquakes.test_table_drive import RECORD, TWIN
 from twin.earthquakes.result import DriveResult, load_table_twin
@@ -23,7 +24,7 @@ from twin.setup.run_config import read_run_config
 from twin.setup.warnings import list_specimen_changes
 from twin.system.files import hash_file
 
-RIG_TOML = (PROFILES_DIR / "rigs" / "hydraulic.toml").read_text(encoding="utf-8")
+RIG_TOML = read_rig_text("hydraulic")
 
 
 def parse_rig(text: str = RIG_TOML) -> RigConfig:
@@ -222,7 +223,7 @@ def test_a_model_of_another_specimen_is_warned_of(
 ) -> None:
     """With the specimen that its parameters do not describe; a gap as such is no difference."""
     provenance = Provenance(masses_kg=(550.0,), gaps_mm=(math.inf,))
-    text = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
+    text = read_model_text("snm")
     text += "\n" + format_toml({"provenance": provenance.model_dump()})
     warnings = list_specimen_changes(text, Specimen(mass_kg=mass_kg, gap_mm=gap_mm))
     assert len(warnings) == bool(words)

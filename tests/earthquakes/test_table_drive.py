@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.config.base import PROFILES_DIR
 from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
+from tests.builders.rigs import read_rig_text
 from tests.command_line import call_main
 from twin.earthquakes import task
 from twin.earthquakes.result import load_table_twin
@@ -131,7 +131,7 @@ def test_the_search_for_effects_reports_its_stages(
         args[-1]("screening")
         raise InputError("enough")
 
-    rig_toml = (PROFILES_DIR / "rigs" / "hydraulic.toml").read_text(encoding="utf-8")
+    rig_toml = read_rig_text("hydraulic")
     recording = SimpleNamespace(start=SimpleNamespace(rig_toml=rig_toml), run="run")
     monkeypatch.setattr(task, "open_recording", lambda path: recording)
     monkeypatch.setattr(task, "read_table_motion", lambda recording: None)

@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from tests.builders.rigs import read_model_text
 from tests.discovery.played import SNM, format_truth, log
 from tests.laws import laboratory_laws
 from tests.model.cases import RATE_HZ, drive, noisy, typical
@@ -302,7 +303,7 @@ def test_a_bumper_whose_damping_is_not_linear_recovers_without_force(force, unit
 
 def test_commands_take_it(package, tmp_path):
     """`simulate` with both kinds of law, in a process that finds the installed package."""
-    snm_file = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    snm_file = read_model_text("snm")
     model = tmp_path / "model.toml"
     model.write_text(
         snm_file

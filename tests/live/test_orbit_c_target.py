@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from table_io.backends import udp
-from table_io.config.base import PROFILES_DIR
+from tests.builders.rigs import read_rig_text
 from tests.live.test_live import SHAKETWIN
 from tests.table_io.backends.udp_bench import SHIPPED, free_port
 
@@ -56,7 +56,7 @@ def test_unstable_orbits_are_held_through_a_target_in_c(tmp_path: Path) -> None:
     """No sample is lost, the amplitude is that of the model, and the replay is identical."""
     (tmp_path / "branch.toml").write_text(PROFILE)
     with run_target(tmp_path) as port:
-        rig = (PROFILES_DIR / "rigs" / "udp_simulated.toml").read_text()
+        rig = read_rig_text("udp_simulated")
         (tmp_path / "rig.toml").write_text(rig.replace(SHIPPED, f"127.0.0.1:{port}"))
         words = [SHAKETWIN, "run", "branch.toml", "--out", "run"]
         ended = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)

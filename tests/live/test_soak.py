@@ -20,15 +20,16 @@ import numpy as np
 import pytest
 
 from table_io.backends import HEARTBEAT_TIMEOUT_S
-from table_io.config.base import PROFILES_DIR, load_config, parse_toml
+from table_io.config.base import load_config, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.units import GRAVITY_M_S2
 from tests.builders.flight_records import RecordedSession, read_flight_record
+from tests.builders.rigs import read_rig_text
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 CONTROLLER = str(Path(__file__).with_name("controller.py"))
-CARD = (PROFILES_DIR / "rigs" / "machine.toml").read_text()
+CARD = read_rig_text("machine")
 A = 0.05 * GRAVITY_M_S2
 PEAK_RATIO = 1.06  # of the level: a decay multiplies a blend that may itself be at 1.05
 UPDATE = 10 ** (2.0 / 20)  # most that an amplitude update changes, maybe one not yet reported

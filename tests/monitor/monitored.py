@@ -23,6 +23,7 @@ from table_io.records import (
     Timing,
 )
 from table_io.units import GRAVITY_M_S2
+from tests.builders.rigs import RIG_TEXT
 from twin.compare import COMPARED_CHANNELS
 from twin.monitor.run_state import LiveRunState, update_run_state
 from twin.transport.codec import Item
@@ -35,7 +36,6 @@ STEPS = tuple(
         [("forward", f) for f in GRID] + [("backward", f) for f in reversed(GRID)]
     )
 )
-RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
 SENSORS = (
     "drive_disp_m", "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2",
     "force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n",
@@ -53,7 +53,7 @@ def receive(*items: Item, state: LiveRunState | None = None, run: str = RUN) -> 
 
 def start(run: str = RUN) -> RunStart:
     return RunStart(
-        0, run, "watched", "table", PROFILE, RIG, "", RATE, 20, SENSORS, STEPS, 60_000,
+        0, run, "watched", "table", PROFILE, RIG_TEXT, "", RATE, 20, SENSORS, STEPS, 60_000,
         {"mass_disp_m": 0.02}, {}, "lab", "2026-01-01T12:00:00", 0.0,
     )  # fmt: skip
 

@@ -26,11 +26,11 @@ from table_io.records import (
     Trip,
 )
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
+from tests.builders.rigs import RIG_TEXT
 from tests.monitor.monitored import (
     LEVEL,
     PROFILE,
     RATE,
-    RIG,
     RUN,
     SENSORS,
     STEPS,
@@ -223,7 +223,7 @@ def shares(values: np.ndarray, tare: dict[str, float]) -> dict[str, tuple[float,
     n = values.shape[1]
     zeros = np.zeros(n, dtype=np.int64)
     measured = Block("meas", 0, RATE, SENSORS, values, zeros, zeros, zeros)
-    rig, profile = parse_toml(RIG, RigConfig, "rig"), parse_toml(PROFILE, Profile, "profile")
+    rig, profile = parse_toml(RIG_TEXT, RigConfig, "rig"), parse_toml(PROFILE, Profile, "profile")
     rows = compute_live_margins(rig, profile, tare, recent([measured]))
     return {row.name: (row.peak, row.limit, row.limit_source) for row in rows}
 
@@ -247,7 +247,7 @@ def test_margins_know_only_the_last_second() -> None:
     old, new = block(0, 1000), block(1000, 1000)
     old.values.setflags(write=True)
     old.values[4] = 40.0
-    rig, profile = parse_toml(RIG, RigConfig, "rig"), parse_toml(PROFILE, Profile, "profile")
+    rig, profile = parse_toml(RIG_TEXT, RigConfig, "rig"), parse_toml(PROFILE, Profile, "profile")
     noise = {
         row.name: row.peak
         for row in compute_live_margins(rig, profile, {}, recent([old, new], 5.0))
@@ -281,7 +281,7 @@ rate_hz = 1000.0
 def start_sweep() -> tuple[RunStart, Drive]:
     """Return the start record of a short sweep, and its nominal drive."""
     profile = parse_toml(SHORT_SWEEP, Profile, "profile")
-    drive = nominal_drive(make_test_plan(profile, parse_toml(RIG, RigConfig, "rig")))
+    drive = nominal_drive(make_test_plan(profile, parse_toml(RIG_TEXT, RigConfig, "rig")))
     planned = {"steps": drive.steps, "planned_samples": drive.planned_end}
     return replace(start(), profile_toml=SHORT_SWEEP, **planned), drive  # type: ignore[arg-type]
 

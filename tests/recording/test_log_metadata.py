@@ -7,7 +7,7 @@ from itertools import permutations
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR
+from tests.builders.rigs import RIG_TEXT
 from tests.recording.example_run import START
 from twin.recording.log_metadata import (
     ContentHash,
@@ -60,7 +60,7 @@ def test_altered_attachment_is_named(name: str) -> None:
 
 
 def test_the_calibration_names_each_channel() -> None:
-    card = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
+    card = RIG_TEXT
     lost = {"table_disp_m": 1e-4, "mass_disp_m": float("nan")}
     channels = ("drive_disp_m", "table_disp_m", "mass_disp_m")
     calibration = json.loads(

@@ -8,18 +8,16 @@ import numpy as np
 from table_io.block import Block, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.config.rig import RigConfig
 from table_io.excitation.trajectory import plan_sweep
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.rigs import RIG
 from twin.discovery.discover import PreparedLog
 from twin.discovery.signals import build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
-RIG = load_config(PROFILES_DIR / "rigs" / "simulated.toml", RigConfig, "machine card")[0]
 TRUTH = {"stiffness": 31e3, "damping": 1500.0, "bumper_stiffness": 420e3, "bumper_damping": 1300.0}
 CHANNELS = (
     "table_disp_m", "table_acc_m_s2", "mass_disp_m", "mass_acc_m_s2", *RIGHT_CELLS, *LEFT_CELLS,

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from table_io.config.base import PROFILES_DIR
 from table_io.config.toml_text import format_toml
 from table_io.records import RunStop
+from tests.builders.rigs import RIG_TEXT, read_model_text
 from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks
+from tests.reports.folders import draw_in_full_quality
 from twin.cli.table import app
 from twin.model.config import ModelConfig
 from twin.recording.mcap_log import write_items
@@ -24,8 +25,8 @@ GAPS = (2.0, 2.0)
 @cache
 def recording(folder: Path) -> Path:
     """A log as a run leaves it."""
-    rig = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
-    snm = (PROFILES_DIR / "models" / "snm.toml").read_text(encoding="utf-8")
+    rig = RIG_TEXT
+    snm = read_model_text("snm")
     bundle = from_texts("short", format_toml(card(*GAPS)), rig, snm, "test")
     start = replace(bundle.make_start_factory("short", "table")({}, 0.0), channels=CHANNELS)
     (block,) = make_noisy_blocks(0.01, 3, GAPS)
@@ -39,7 +40,8 @@ def identification(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]
     """(where the model lies, what the terminal said)."""
     folder = tmp_path_factory.mktemp("identify")
     out = folder / "found.toml"
-    outcome = CliRunner().invoke(app, ["identify", str(recording(folder)), "--out", str(out)])
+    with draw_in_full_quality():
+        outcome = CliRunner().invoke(app, ["identify", str(recording(folder)), "--out", str(out)])
     assert outcome.exit_code == 0, outcome.output
     return out, outcome.output
 

@@ -1,6 +1,5 @@
 """What a person is shown of a discovery: the page, its figures, for each of the four verdicts."""
 
-import hashlib
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,9 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
+from tests.builders.rigs import RIG_TEXT
+from tests.builders.truths import hide_truth
 from tests.reports.folders import draw_in_full_quality
 from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import Discovery, PreparedLog, discover_effects
@@ -83,12 +84,9 @@ class DiscoveryOutput:
 
 def record_run(folder: Path) -> Path:
     """The log of a short unpaced run, of a rig whose bumpers harden."""
-    truth, card = folder / "truth.toml", folder / "rig.toml"
+    card = folder / "rig.toml"
     text = f'[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = {HARDENING_N_M2} }}\n'
-    truth.write_text(text)
-    sealed = hashlib.sha256(text.encode()).hexdigest()
-    rig = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
-    card.write_text(f'{rig}truth = "{truth}"\ntruth_sha256 = "{sealed}"\n')
+    card.write_text(hide_truth(RIG_TEXT, folder, text))
     (folder / "p.toml").write_text(SHORT.format(rig=card))
     log = folder / "hard.mcap"
     play_unpaced(read_run_config(folder / "p.toml"), "hard", log, lambda: None, lambda item: None)

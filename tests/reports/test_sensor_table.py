@@ -6,16 +6,16 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart
+from tests.builders.rigs import RIG_TEXT
 from twin.cli.table import app
 from twin.recording.reader import read_recording
 from twin.results.sensor_table import build_sensor_rows
 
-TEXT = (PROFILES_DIR / "rigs" / "simulated.toml").read_text(encoding="utf-8")
 ACC, CELL = 'channel = "table_acc_m_s2"\n', 'channel = "force_l2_n"\n'
-CARD = TEXT.replace(
+CARD = RIG_TEXT.replace(
     ACC, f'{ACC}maker = "PCB"\nmodel = "3713B"\nserial = "LW 12"\ncalibrated = 2020-03-11\n'
     'interval_months = 12\ncertificate = "K-77"\ncalibrated_by = "<the institute>"\n'
 ).replace(CELL, f"{CELL}due = 2999-01-01\n")  # fmt: skip

@@ -13,7 +13,8 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.tracking import TrackingConfig
 from table_io.units import GRAVITY_M_S2
-from tests.setup.test_record import NO_CHECK, RIG, Run, play_run
+from tests.builders.rigs import RIG_TEXT
+from tests.setup.test_record import NO_CHECK, Run, play_run
 from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
@@ -168,7 +169,7 @@ def test_a_test_that_was_stopped_is_judged_as_far_as_it_went(tmp_path: Path) -> 
 
 
 def test_lost_samples_are_stated_and_the_spectra_are_not(tmp_path: Path) -> None:
-    rig = f'{RIG}\n[[simulated.faults]]\nat_s = 4.0\nfor_s = 0.005\nkind = "dropped"\n'
+    rig = f'{RIG_TEXT}\n[[simulated.faults]]\nat_s = 4.0\nfor_s = 0.005\nkind = "dropped"\n'
     _, recording, summary = play_run(tmp_path, NO_CHECK, rig)
     tracking = summary.tracking
     assert summary.verdict == "complete"

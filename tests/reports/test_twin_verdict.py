@@ -1,6 +1,5 @@
 """Verdict on the twin: agrees on clean rigs, departs where the specimen is another one."""
 
-import hashlib
 import json
 import math
 import tomllib
@@ -15,6 +14,7 @@ from table_io.block import Block
 from table_io.config.toml_text import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
 from tests.builders.rigs import RIG_TEXT
+from tests.builders.truths import seal_truth
 from twin.compare.monitoring.cycle import ChannelNoise
 from twin.recording.reader import read_recording
 from twin.results.contracts import RunSummary, TwinVerdict
@@ -65,9 +65,7 @@ def run_test(
     rig = tomllib.loads(RIG_TEXT)
     simulated = rig["simulated"]
     if truth:
-        (folder / "truth.toml").write_text(truth)
-        digest = hashlib.sha256(truth.encode()).hexdigest()
-        simulated |= {"truth": str(folder / "truth.toml"), "truth_sha256": digest}
+        simulated |= seal_truth(folder, truth)
     sensors = [
         sensor | ({"range": laser_range_mm} if sensor["channel"] == "mass_disp_m" else {})
         for sensor in rig["sensors"]

@@ -15,8 +15,8 @@ from table_io.acquisition.session import OperatorCommand, run_session
 from table_io.backends import open_backend
 from table_io.block import Block, Label, join_blocks
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR
 from table_io.records import Check, Event, Level, PrcPoint, RunStop, Trip
+from tests.builders.rigs import RIG_TEXT
 from tests.replay.in_memory import recorded_in
 from tests.table_io.excitation.pulse_train import PulseTrain
 from twin.exchange.export import ExportOptions, export_log
@@ -30,7 +30,6 @@ from twin.setup.unpaced import play_unpaced
 from twin.simulation.command import simulate_profile
 from twin.transport.codec import Item
 
-RIG = (PROFILES_DIR / "rigs" / "simulated.toml").read_text()
 RECORD = """title = "A short record"
 [specimen]
 mass_kg = 550.0
@@ -200,7 +199,7 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
     fault: str, kinds: set[str], tmp_path: Path
 ) -> None:
     at_s = 4.0
-    rig = f"{RIG}\n[[simulated.faults]]\nat_s = {at_s}\n{fault}\n"
+    rig = f"{RIG_TEXT}\n[[simulated.faults]]\nat_s = {at_s}\n{fault}\n"
     config, recording, summary = play_run(tmp_path, NO_CHECK, rig)
     (trip,) = recording.records(Trip)
     assert summary.verdict == "aborted"

@@ -9,7 +9,6 @@ Some minutes a profile.
 """
 
 import argparse
-import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,6 +23,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.config.toml_text import format_toml
 from table_io.records import Event, Record
 from table_io.sim.imperfections import Level, draw_laboratory
+from tests.builders.truths import hide_truth
 from twin.compare.monitoring import EVENT_KINDS
 from twin.setup.run_config import RunConfig, from_texts
 from twin.setup.unpaced import add_twin_items
@@ -37,12 +37,7 @@ def iter_session(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfi
     """Every item of a session with that truth."""
     files = (f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")
     profile, rig, model = ((PROFILES_DIR / file).read_text() for file in files)
-    if truth:
-        sealed = folder / "truth.toml"
-        sealed.write_text(truth)
-        digest = hashlib.sha256(truth.encode()).hexdigest()
-        more = f'[simulated]\ntruth = "{sealed}"\ntruth_sha256 = "{digest}"'
-        rig = rig.replace("[simulated]", more)
+    rig = hide_truth(rig, folder, truth)
     bundle, clock = from_texts(name, profile, rig, model, name), ManualClock()
     backend = open_backend(bundle.rig, bundle.profile, clock)
     start = bundle.make_start_factory("r", "table")

@@ -11,9 +11,10 @@ import pytest
 from SALib.analyze import sobol
 from SALib.test_functions import Ishigami
 
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import parse_toml
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
+from tests.builders.rigs import read_model_text
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.sweeps.small_study import STUDY, TEST, make_stored_study, write_study
@@ -411,7 +412,7 @@ def test_magnitudes_count_an_offset_and_amplitudes_do_not(tmp_path: Path) -> Non
 
 def test_a_model_is_found_beside_the_test_that_names_it(tmp_path: Path) -> None:
     (tmp_path / "tests").mkdir()
-    model = (PROFILES_DIR / "models" / "snm.toml").read_text().replace("36000.0", "37000.0")
+    model = read_model_text("snm").replace("36000.0", "37000.0")
     (tmp_path / "tests" / "own.toml").write_text(model)
     (tmp_path / "tests" / "across.toml").write_text('model = "own.toml"\n' + TEST)
     path = tmp_path / "study.toml"

@@ -18,15 +18,14 @@ from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calib
 from table_io.errors import InputError
 from tests.builders.rigs import RIG_TEXT
 
-TEXT = RIG_TEXT
 TODAY = date(2026, 3, 10)
 HEAD = 'channel = "table_acc_m_s2"\nunit = "g"\n'
 
 
 def card(*lines: str) -> str:
     """The shipped card with more lines on its table's accelerometer."""
-    assert TEXT.count(HEAD) == 1
-    return TEXT.replace(HEAD, HEAD + "\n".join(lines) + "\n")
+    assert RIG_TEXT.count(HEAD) == 1
+    return RIG_TEXT.replace(HEAD, HEAD + "\n".join(lines) + "\n")
 
 
 def acc(*lines: str) -> SensorConfig:
@@ -66,7 +65,7 @@ def test_months_end_where_a_month_ends(calibrated: str, months: int, due: str) -
 
 
 def test_undated_sensors_of_a_real_table_are_overdue() -> None:
-    assert find_overdue_calibrations(parse_toml(TEXT, RigConfig, "card"), TODAY) == []
+    assert find_overdue_calibrations(parse_toml(RIG_TEXT, RigConfig, "card"), TODAY) == []
     real = parse_toml(card("due = 2027-01-01"), RigConfig, "card").model_copy(
         update={"simulated": None}
     )
@@ -82,7 +81,7 @@ def test_sensors_with_overdue_impossible_or_no_dates_are_counted(
     count: int, is_simulated: bool
 ) -> None:
     """The first `count` sensors after the command have the dates; the others are in order."""
-    simulated = parse_toml(TEXT, RigConfig, "card")
+    simulated = parse_toml(RIG_TEXT, RigConfig, "card")
     rig = simulated if is_simulated else simulated.model_copy(update={"simulated": None})
     days = {shift: (TODAY + timedelta(shift)).isoformat() for shift in (-400, -1, 0, 1, 400)}
     assert rig.sensors[0].channel == "drive_disp_m"
@@ -129,7 +128,7 @@ def test_record_comes_back_from_its_file_as_it_was(by: str, number: float) -> No
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     file = tmp_path / "mine.toml"
-    file.write_text(TEXT, encoding="utf-8")
+    file.write_text(RIG_TEXT, encoding="utf-8")
     return file
 
 
@@ -141,7 +140,7 @@ def put(path: Path, name: str, calibration: CalibrationRecord) -> None:
 
 def test_card_without_records_is_read_as_it_is(path: Path) -> None:
     rig, text = load_rig(path)
-    assert text == TEXT
+    assert text == RIG_TEXT
     assert rig.calibrations == ()
 
 
@@ -154,10 +153,10 @@ def test_newest_record_of_each_channel_goes_into_the_text_of_the_card(path: Path
         ("table_acc_m_s2", "new"),
         ("mass_acc_m_s2", "anna"),
     }
-    assert text.startswith(TEXT)
+    assert text.startswith(RIG_TEXT)
     assert parse_toml(text, RigConfig, "as recorded") == rig
     # a record tells; it changes nothing that is measured
-    assert rig.sensors == parse_toml(TEXT, RigConfig, "card").sensors
+    assert rig.sensors == parse_toml(RIG_TEXT, RigConfig, "card").sensors
 
 
 def test_newest_record_is_so_by_its_time_and_not_by_the_name_of_its_file(path: Path) -> None:
@@ -199,7 +198,7 @@ def test_bad_record_is_named_by_its_own_file(path: Path) -> None:
 
 
 def test_simulated_cards_differ_from_the_first_only_in_how_they_are_reached() -> None:
-    first = parse_toml(TEXT, RigConfig, "card").model_dump(exclude={"name", "title", "backend"})
+    first = parse_toml(RIG_TEXT, RigConfig, "card").model_dump(exclude={"name", "title", "backend"})
     for path in (PROFILES_DIR / "rigs").glob("*_simulated.toml"):
         other = load_rig(path)[0]
         reached = {"machine", "ni", "opendaq", "udp", "follow"}

@@ -9,17 +9,15 @@ from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
 from table_io.block import Float1D, Float2D
-from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Specimen
-from table_io.config.rig import RigConfig
 from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.hydraulic_table import BRISTLE, SPOOL, HydraulicCoefficients, P
 from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
-from tests.builders.rigs import compute_oil_column_hz
+from tests.builders.rigs import compute_oil_column_hz, read_rig
 
 RATE_HZ = 1000.0
-RIG = load_config(PROFILES_DIR / "rigs" / "hydraulic.toml", RigConfig, "rig")[0]
+RIG = read_rig("hydraulic")
 CONFIG = RIG.require_section("simulated", SimulatedTableConfig)
 FREE = Specimen(mass_kg=550.0, gap_mm=math.inf)
 MASS_KG = CONFIG.moving_mass_kg

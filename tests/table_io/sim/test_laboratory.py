@@ -1,6 +1,5 @@
 """Imperfect laboratory: each imperfection against a closed form or its measured response."""
 
-import hashlib
 import math
 from pathlib import Path
 
@@ -26,7 +25,8 @@ from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import Plant
 from table_io.sim.simulated_table import Digitizer, SimulatedBackend, hide_laws
 from tests.builders.profiles import SPECIMEN
-from tests.builders.rigs import RIG
+from tests.builders.rigs import RIG, change_rig
+from tests.builders.truths import seal_truth
 
 CHANNELS = RIG.channels
 RATE_HZ = 2000.0
@@ -34,9 +34,7 @@ GRAVITY_M_S2 = 9.80665
 TURN = 2 * np.pi
 ROW = {name: row for row, name in enumerate(CHANNELS)}
 ACCELEROMETERS = [ROW["table_acc_m_s2"], ROW["mass_acc_m_s2"]]
-SILENT = RigConfig.model_validate(
-    RIG.model_dump() | {"sensors": [s.model_dump() | {"noise_rms": 0.0} for s in RIG.sensors]}
-)
+SILENT = change_rig(every_sensor={"noise_rms": 0.0})
 NOISE = np.array([s.noise_rms * s.si_per_unit for s in RIG.sensors])
 
 
@@ -87,7 +85,7 @@ def harmonic(line: Float1D, frequency: float, rate: float) -> complex:
     return complex(a, -b)
 
 
-def machine(folder: Path, entries: list[Imperfection] | None, **keys: object) -> SimulatedBackend:
+def machine(folder: Path, entries: list[Imperfection] | None, **keys: float) -> SimulatedBackend:
     """An open machine with these imperfections; None: with an empty truth."""
     table = GroundTruth(imperfections=tuple(entries or ()))
     lines = []
@@ -96,15 +94,9 @@ def machine(folder: Path, entries: list[Imperfection] | None, **keys: object) ->
         text = "".join(f'{key} = "{value}"\n' for key, value in places.items() if value)
         numbers = ", ".join(f"{key} = {value!r}" for key, value in e.parameters.items())
         lines.append(f'[[imperfections]]\nid = "{e.id}"\n{text}parameters = {{ {numbers} }}\n')
-    path = folder / "truth.toml"
-    path.write_text("".join(lines))
-    raw = RIG.model_dump()
-    for sensor in raw["sensors"]:
-        sensor.update(keys)
-    raw["simulated"].update(
-        truth=str(path), truth_sha256=hashlib.sha256(path.read_bytes()).hexdigest()
-    )
-    backend = SimulatedBackend(RigConfig.model_validate(raw), SPECIMEN, RATE_HZ, ManualClock())
+    keys_of_truth = seal_truth(folder, "".join(lines))
+    rig = change_rig(every_sensor=keys, simulated=keys_of_truth)
+    backend = SimulatedBackend(rig, SPECIMEN, RATE_HZ, ManualClock())
     backend.open()
     return backend
 
