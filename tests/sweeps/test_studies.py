@@ -26,7 +26,7 @@ from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_model
 from twin.simulation.command import simulate_profile
 from twin.studies import figures
-from twin.studies.cases import parse_gaps_mm
+from twin.studies.batch import parse_gaps_mm
 from twin.studies.result import COLUMNS, SweepSummary, read_batch_rows
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")

@@ -2,8 +2,8 @@
 
 from rich.table import Table
 
-from twin.branches.map_page import format_map_headline
 from twin.branches.page import list_bifurcations
+from twin.branches.resonance_map import format_map_headline
 from twin.branches.task import BranchOptions, follow_branches
 from twin.drawing.branch_curves import BranchSet
 from twin.system.terminal import announce_if_slow, console, print_line

@@ -22,7 +22,7 @@ from twin.drawing.branch_figures import (
     draw_branch_figures,
     period_colour,
 )
-from twin.drawing.page import embed_images, render_page
+from twin.drawing.page import embed_images, write_page
 from twin.dynamics.continuation import Branch, BranchEnd
 from twin.dynamics.orbits import Orbit
 
@@ -47,7 +47,8 @@ def write_branch_report(
     diagram.write(folder / "branches.json")
     write_table(diagram, folder / "branches.csv")
     data = make_page_data(branches)
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("page.html"),
         title=title,
         subtitle=subtitle,
@@ -59,9 +60,6 @@ def write_branch_report(
         model=model_toml,
         data=json.dumps(data, separators=(",", ":")).replace("</", "<\\/"),
     )
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def write_table(diagram: BranchDiagram, path: Path) -> None:

@@ -26,7 +26,7 @@ from twin.campaign.gap_comparison import (
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import SYMBOLS, embed_pairs, list_gap_tables
 from twin.campaign.result import CampaignInfo, CampaignSummary
-from twin.drawing.page import render_page
+from twin.drawing.page import write_page
 from twin.model.valid_range import EVENT_KIND
 from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.contracts import MotionResult, PeakAndRms, RunInfo, RunSummary, WindowResult
@@ -130,7 +130,8 @@ def simulate_gaps(options: GapOptions, watch: Watch | None = None) -> SimulatedG
         warnings=warnings,
     )
     summary.write(folder / "summary.json")
-    page = render_page(
+    page = write_page(
+        folder,
         Path(__file__).with_name("gap_page.html"),
         summary=summary,
         gaps=described,
@@ -141,8 +142,7 @@ def simulate_gaps(options: GapOptions, watch: Watch | None = None) -> SimulatedG
         symbols=SYMBOLS,
         gap_name=format_gap,
     )
-    (folder / "report.html").write_text(page, encoding="utf-8")
-    return SimulatedGaps(comparison, folder / "report.html", summary.reason, tuple(warnings))
+    return SimulatedGaps(comparison, page, summary.reason, tuple(warnings))
 
 
 def simulate_peaks(config: RunConfig) -> tuple[RunSummary, list[str]]:

@@ -32,7 +32,7 @@ from twin.discovery.words import (
     tabulate_comparisons,
     typeset_proposal,
 )
-from twin.drawing.page import MAX_PLAIN, embed_images, format_significant, render_page
+from twin.drawing.page import MAX_PLAIN, embed_images, format_significant, write_page
 from twin.results.quantities import format_quantity
 
 DIGITS, MAX_DECIMALS = 4, 9  # of a fitted value
@@ -49,7 +49,8 @@ def write_discovery_page(folder: Path, result: DiscoveredModel) -> Path:
     view = DiscoveryView(result.discovery, logs, result.law)
     runs = run_logs_free(view)
     pictures = draw_discovery_figures(view, verdict, runs, folder / "figures")
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("page.html"),
         verdict=verdict,
         sentence=format_verdict(verdict),
@@ -74,9 +75,6 @@ def write_discovery_page(folder: Path, result: DiscoveredModel) -> Path:
         },
         model=result.model_toml,
     )
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def order_sections(verdict: Verdict) -> dict[str, str]:
@@ -185,7 +183,8 @@ def _log_facts(log: PreparedLog) -> LogFacts:
 
 def write_identification_page(folder: Path, fitted: FittedModel, model_name: str) -> Path:
     """Write folder/report.html of an identification and its figures; return the path."""
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("identify.html"),
         report=fitted.report,
         estimate=format_estimate,
@@ -195,9 +194,6 @@ def write_identification_page(folder: Path, fitted: FittedModel, model_name: str
         model=fitted.model_toml,
         model_name=model_name,
     )
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def format_estimate(estimate: Interval) -> str:

@@ -42,6 +42,13 @@ def render_page(template: Path, **values: Any) -> str:
     return environment.get_template(template.name).render(**values)
 
 
+def write_page(folder: Path, template: Path, **values: Any) -> Path:
+    """Write folder/report.html from a template, as `render_page`; return its path."""
+    path = folder / "report.html"
+    path.write_text(render_page(template, **values), encoding="utf-8")
+    return path
+
+
 def embed_images(pictures: Iterable[Picture]) -> list[tuple[Picture, str]]:
     """Return (picture, its PNG in base64) pairs for embedding in a page."""
     return [(picture, base64.b64encode(picture.path.read_bytes()).decode()) for picture in pictures]

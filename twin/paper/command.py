@@ -51,12 +51,10 @@ def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: Mo
         )
     images = [picture for _, pictures in figure_sets for picture in pictures]
     write_paper_json(rows, study, source, images, folder / "paper.json")
-    write_paper_page(rows, study, source, figure_sets, folder / "report.html")
+    page = write_paper_page(rows, study, source, figure_sets, folder)
     for row in rows:
         print_line(f"{row.case}: paper: {row.paper}; {source.name}: {row.model}")
         style = "bold red" if row.verdict == DEPARTS else ""
         console.print(f"    {row.verdict}", style=style, highlight=False)
     departures = sum(row.verdict == DEPARTS for row in rows)
-    print_line(
-        f"{source.name}: {len(rows)} statements, {departures} depart -> {folder / 'report.html'}"
-    )
+    print_line(f"{source.name}: {len(rows)} statements, {departures} depart -> {page}")

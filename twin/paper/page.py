@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from twin.drawing.page import embed_images, render_page
+from twin.drawing.page import embed_images, write_page
 from twin.drawing.plot_style import CaptionedFigures, Picture, save_figures
 from twin.drawing.prc_families import draw_all_gaps, draw_transition
 from twin.model.config import ModelConfig
@@ -110,15 +110,19 @@ def write_paper_page(
     study: PaperStudy,
     source: ModelSource,
     figure_sets: list[tuple[str, list[Picture]]],
-    path: Path,
-) -> None:
-    """Write a self-contained HTML file: the table, then each set of figures."""
+    folder: Path,
+) -> Path:
+    """Write report.html, self-contained: the table, then each set of figures; return its path."""
     figure_images = [(title, embed_images(pictures)) for title, pictures in figure_sets]
     counts = {verdict: sum(row.verdict == verdict for row in rows) for verdict in VERDICTS}
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("paper.html"),
-        rows=rows, sets=figure_images, counts=counts, model=source, exact=study.is_exact,
+        rows=rows,
+        sets=figure_images,
+        counts=counts,
+        model=source,
+        exact=study.is_exact,
         models={name: case.simulator.model.flatten() for name, case in study.cases.items()},
         paper_model=source.toml_text == read_model(PAPER_MODEL)[1],
-    )  # fmt: skip
-    path.write_text(text, encoding="utf-8")
+    )

@@ -76,7 +76,7 @@ class ComparisonRow:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class ModelFinding:
     """What the model gives on a statement, in words and numbers, and the verdict.
 
     `hz` stands in the name of the case, and `rule` in place of the statement's.
@@ -142,12 +142,12 @@ def _relative_difference(reference: Float1D, curve: Float1D) -> float:
     return float(np.abs(reference - curve).max() / reference.max())
 
 
-def _compare_definition(study: PaperStudy) -> Finding:
+def _compare_definition(study: PaperStudy) -> ModelFinding:
     """Compare the mean over cycles of Eq. 1 with the extremes over all of them."""
     excess, at_hz, cycles = max(
         _list_excesses(study.cases["G4"]), key=lambda entry: entry[0], default=(0.0, np.nan, 0)
     )
-    return Finding(
+    return ModelFinding(
         f"every η here is the mean over the last {cycles} cycles of each cycle's ratio; with the "
         f"largest and the smallest value over these cycles η_d is the same where the motion is "
         f"periodic, and up to {100 * excess:.1f} % more in chaos (at {at_hz:g} Hz)",
@@ -167,7 +167,7 @@ def _list_excesses(case: PaperCase) -> Iterator[tuple[float, float, int]]:
                 yield value, step.frequency_hz, cycles
 
 
-def _find_free_flight(study: PaperStudy) -> Finding:
+def _find_free_flight(study: PaperStudy) -> ModelFinding:
     case = study.cases["G∞"]
     u, a, hz = free_flight_resonance(case.parameters, case.acceleration)
     method = "continuous in frequency"
@@ -179,7 +179,7 @@ def _find_free_flight(study: PaperStudy) -> Finding:
     off_resonance = Quote(
         "in particular, the numerical curve is below the experimental one", "Sect. 5"
     )
-    return Finding(
+    return ModelFinding(
         f"{hz:.3f} Hz, u* = {1e3 * u:.3f} mm, a* = {a:.3f} m/s² ({method}); "
         f"{peak_mm:.2f} mm at {peak_hz:g} Hz on the 0.1 Hz grid",
         NOT_COMPARED,
@@ -196,29 +196,29 @@ def _find_free_flight(study: PaperStudy) -> Finding:
     )
 
 
-def _find_hardening(study: PaperStudy, name: str) -> Finding:
+def _find_hardening(study: PaperStudy, name: str) -> ModelFinding:
     fold = study.folds[name]
     if fold is None:
-        return Finding(NO_HYSTERESIS, DEPARTS, {"down_hz": np.nan, "up_hz": np.nan})
+        return ModelFinding(NO_HYSTERESIS, DEPARTS, {"down_hz": np.nan, "up_hz": np.nan})
     down, up = fold.forward_hz, fold.backward_hz
-    return Finding(
+    return ModelFinding(
         f"down-jump at {down:.3f} Hz, up-jump at {up:.3f} Hz ({fold.method})",
         _judge(fold.kind == "right"),
         {"down_hz": down, "up_hz": up},
     )
 
 
-def _find_hysteresis(study: PaperStudy) -> Finding:
+def _find_hysteresis(study: PaperStudy) -> ModelFinding:
     """Find the folds and the graze of G4, and where ten-cycle steps leave its upper branch."""
     fold = study.folds["G4"]
     if fold is None:
-        return Finding(NO_HYSTERESIS, DEPARTS)
+        return ModelFinding(NO_HYSTERESIS, DEPARTS)
     graze = findings.find_graze_hz(study.cases["G4"], study.slow_sweeps["G4"])
     last_test = study.cases["G4"].tests[-1]
     frequencies, eta_r = extract_prc(last_test.points, "twin", "forward", "eta_r")
     last_hz = float(frequencies[eta_r > 0].max())
     name = "fold" if study.is_exact else "jump"
-    return Finding(
+    return ModelFinding(
         f"{name} down {fold.forward_hz:.3f} Hz, graze {graze:.3f} Hz, {name} up "
         f"{fold.backward_hz:.3f} Hz ({fold.method}); in ten-cycle steps the forward sweep still "
         f"impacts at {last_hz:g} Hz",
@@ -239,15 +239,17 @@ def _list_peaks(study: PaperStudy, quantity: str) -> list[float]:
     return [float(max(eta.max() for eta in sweep.values())) for sweep in sweeps]
 
 
-def _find_displacement_trend(study: PaperStudy) -> Finding:
+def _find_displacement_trend(study: PaperStudy) -> ModelFinding:
     eta_d = _list_peaks(study, "eta_d")
-    return Finding(f"largest η_d {_list(eta_d, '.3f')}", _judge(_falls(eta_d)), {"eta_d": eta_d})
+    return ModelFinding(
+        f"largest η_d {_list(eta_d, '.3f')}", _judge(_falls(eta_d)), {"eta_d": eta_d}
+    )
 
 
-def _find_acceleration_trend(study: PaperStudy) -> Finding:
+def _find_acceleration_trend(study: PaperStudy) -> ModelFinding:
     eta_a = _list_peaks(study, "eta_a")
     largest = int(np.argmax(eta_a))
-    return Finding(
+    return ModelFinding(
         f"largest η_a {_list(eta_a, '.2f')}: largest at {TREND_GAPS[largest]}",
         _judge(largest > 0 and _falls(eta_a[largest:])),
         {"eta_a": eta_a},
@@ -259,7 +261,7 @@ def _list_ratios(points: tuple[PrcPoint, ...], *names: str) -> Float1D:
     return np.array([getattr(point.twin, name) for name in names for point in points])
 
 
-def _find_bumper_trend(study: PaperStudy) -> Finding:
+def _find_bumper_trend(study: PaperStudy) -> ModelFinding:
     eta_j, r_j = (
         [float(_list_ratios(study.cases[name].points, *sides).max()) for name in TREND_GAPS]
         for sides in (("eta_r", "eta_l"), ("r_r", "r_l"))
@@ -269,7 +271,7 @@ def _find_bumper_trend(study: PaperStudy) -> Finding:
         0 < top < len(POSITIVE_GAPS) and _rises(values[: top + 1]) and _falls(values[top:])
         for top, values in zip(largest, (eta_j, r_j), strict=True)
     )
-    return Finding(
+    return ModelFinding(
         f"largest η_j {_list(eta_j, '.4f')}; largest r_j {_list(r_j, '.4f')}: largest at "
         + " and ".join(TREND_GAPS[top] for top in largest),
         _judge(rises_and_falls),
@@ -277,7 +279,7 @@ def _find_bumper_trend(study: PaperStudy) -> Finding:
     )
 
 
-def _find_ratios_in_flight(study: PaperStudy) -> Finding:
+def _find_ratios_in_flight(study: PaperStudy) -> ModelFinding:
     flights = [
         point.twin
         for name in POSITIVE_GAPS
@@ -287,19 +289,19 @@ def _find_ratios_in_flight(study: PaperStudy) -> Finding:
     largest = max(
         (max(each.eta_r, each.eta_l, each.r_r, each.r_l) for each in flights), default=np.nan
     )
-    return Finding(
+    return ModelFinding(
         f"largest η_j or r_j {largest:g} at the {len(flights)} grid points without impact",
         _judge(largest == 0),
         {"points": len(flights), "largest": largest},
     )
 
 
-def _find_ratios_in_contact(study: PaperStudy) -> Finding:
+def _find_ratios_in_contact(study: PaperStudy) -> ModelFinding:
     smallest = [
         float(_list_ratios(study.cases[name].points, "eta_r", "eta_l", "r_r", "r_l").min())
         for name in ("G0", "G-1", "G-2", "G-10")
     ]
-    return Finding(
+    return ModelFinding(
         f"smallest η_j or r_j {_list(smallest, '.4f')}",
         _judge(min(smallest) > 0),
         {"smallest": smallest},
@@ -315,7 +317,7 @@ def _list_offsets(study: PaperStudy) -> dict[str, float]:
     }
 
 
-def _find_offset(study: PaperStudy) -> Finding:
+def _find_offset(study: PaperStudy) -> ModelFinding:
     offsets = _list_offsets(study)
     smallest = [
         min(
@@ -326,7 +328,7 @@ def _find_offset(study: PaperStudy) -> Finding:
     ]
     above = [eta - offset for eta, offset in zip(smallest, offsets.values(), strict=True)]
     pairs = zip(above, offsets.values(), strict=True)
-    return Finding(
+    return ModelFinding(
         "η_j starts above the pre-strain over u*: "
         + ", ".join(f"{offset + rest:.4f} against {offset:.4f}" for rest, offset in pairs),
         _judge(min(above) > 0),
@@ -334,7 +336,7 @@ def _find_offset(study: PaperStudy) -> Finding:
     )
 
 
-def _find_shift(study: PaperStudy) -> Finding:
+def _find_shift(study: PaperStudy) -> ModelFinding:
     offsets = _list_offsets(study)
 
     def shift(name: str, direction: str) -> Float1D:
@@ -342,7 +344,7 @@ def _find_shift(study: PaperStudy) -> Finding:
         return eta - offsets[name]
 
     difference = max(_relative_difference(shift("G-10", d), shift("G-2", d)) for d in DIRECTIONS)
-    return Finding(
+    return ModelFinding(
         f"η_j less the pre-strain differs by up to {100 * difference:.0f} % of G-10's peak: G-2 "
         "still detaches",
         _judge(difference < MAX_CURVE_DIFFERENCE),
@@ -350,23 +352,23 @@ def _find_shift(study: PaperStudy) -> Finding:
     )
 
 
-def _find_coexistence(study: PaperStudy) -> Finding:
+def _find_coexistence(study: PaperStudy) -> ModelFinding:
     orbits = findings.find_coexisting_orbits(
         study.cases["G4"], study.slow_sweeps["G4"], COEXISTING_HZ
     )
     if orbits is None:
-        return Finding("one solution", DEPARTS)
+        return ModelFinding("one solution", DEPARTS)
     impacting_mm, flight_mm = 1e3 * orbits.forward_m, 1e3 * orbits.backward_m
     text = f"{impacting_mm:.3f} mm impacting, {flight_mm:.3f} mm in flight"
     values: RowValues = {"impacting_mm": impacting_mm, "flight_mm": flight_mm}
     if orbits.unstable is None:
         text += "; the third is computed only for models in closed form"
-        return Finding(text, AGREES, values, rule="two steady motions, one for each direction")
+        return ModelFinding(text, AGREES, values, rule="two steady motions, one for each direction")
     unstable_mm = 1e3 * orbits.unstable.u_max
     first, second = (float(abs(m)) for m in orbits.unstable.multipliers[:2])
     text += f", and the UNSTABLE {unstable_mm:.3f} mm (multipliers {first:.3f}, {second:.3f})"
     values |= {"unstable_mm": unstable_mm, "multiplier_1": first, "multiplier_2": second}
-    return Finding(text, AGREES, values)
+    return ModelFinding(text, AGREES, values)
 
 
 def format_shares(study: PaperStudy, hz: float) -> str:
@@ -377,7 +379,7 @@ def format_shares(study: PaperStudy, hz: float) -> str:
     return ", ".join(phrases) + " of the cycles"
 
 
-def _find_left_hystereses(study: PaperStudy) -> Finding:
+def _find_left_hystereses(study: PaperStudy) -> ModelFinding:
     intervals = {
         name: [[i.from_hz, i.to_hz] for i in scan.intervals]
         for name, scan in study.secondary.items()
@@ -387,7 +389,7 @@ def _find_left_hystereses(study: PaperStudy) -> Finding:
         for name, own in intervals.items()
         if own
     )
-    return Finding(
+    return ModelFinding(
         f"left hysteresis of {listed} (slow passage; the tests start at 0.5 Hz)"
         if listed
         else "no left hysteresis",
@@ -396,22 +398,22 @@ def _find_left_hystereses(study: PaperStudy) -> Finding:
     )
 
 
-def _count_left_hystereses(study: PaperStudy) -> Finding:
+def _count_left_hystereses(study: PaperStudy) -> ModelFinding:
     counts = [len(study.secondary[name].intervals) for name in POSITIVE_GAPS]
     pairs = zip(POSITIVE_GAPS, counts, strict=True)
-    return Finding(
+    return ModelFinding(
         "left hystereses " + ", ".join(f"{name}: {count}" for name, count in pairs),
         _judge(all(np.diff(counts) >= 0) and 0 < counts[-2] < counts[-1]),
         {"counts": counts},
     )
 
 
-def _find_secondary_positions(study: PaperStudy) -> Finding:
+def _find_secondary_positions(study: PaperStudy) -> ModelFinding:
     own = [study.find_own_hz(hz) for hz in SECONDARY_HZ]
     pairs = [(hz, paper) for hz, paper in zip(own, SECONDARY_HZ, strict=True) if hz is not None]
     errors = [hz / paper - 1 for hz, paper in pairs]
     worst = max(map(abs, errors)) if len(errors) == len(own) else np.inf
-    return Finding(
+    return ModelFinding(
         ", ".join(f"{hz:.3f} Hz ({_format_difference(hz, paper)})" for hz, paper in pairs)
         + " (where the forward sweep jumps up)"
         if pairs
@@ -430,18 +432,18 @@ def _measure_own_impacts(study: PaperStudy, paper_hz: float, count: int) -> Impa
     return low_frequency.measure_impact_sequence(case, hz, state, count)
 
 
-def _count_impacts(study: PaperStudy, hz: float, usual: int) -> Finding:
+def _count_impacts(study: PaperStudy, hz: float, usual: int) -> ModelFinding:
     """Count the impacts of a cycle: `usual` a side, sometimes one more."""
     distribution, pair = study.impacts[hz], (usual, usual)
     share_sometimes = distribution.share_at_least(usual + 1)
-    return Finding(
+    return ModelFinding(
         f"impacts right/left {format_shares(study, hz)}",
         _judge(distribution.most_frequent == pair and share_sometimes > 0),
         {"usual_share": distribution.share(pair), "sometimes_share": share_sometimes},
     )
 
 
-def _count_impacts_at_third(study: PaperStudy) -> Finding:
+def _count_impacts_at_third(study: PaperStudy) -> ModelFinding:
     hz = SECONDARY_HZ[2]
     distribution, own_hz = study.impacts[hz], study.find_own_hz(hz)
     gap = findings.find_two_impact_gap_mm(study.cases["G4"], hz)
@@ -454,7 +456,7 @@ def _count_impacts_at_third(study: PaperStudy) -> Finding:
         else ""
     )
     only = f"2/2 only up to G = {gap:.2f} mm" if gap > 0 else "2/2 at no gap up to 4 mm"
-    return Finding(
+    return ModelFinding(
         f"{at_own}at {hz:g} Hz right/left {format_shares(study, hz)}; there {only}",
         _judge(own_share > 0.5),
         {
@@ -467,14 +469,14 @@ def _count_impacts_at_third(study: PaperStudy) -> Finding:
     )
 
 
-def _compare_second_impact(study: PaperStudy) -> Finding:
+def _compare_second_impact(study: PaperStudy) -> ModelFinding:
     hz = SECONDARY_HZ[2]
     impacts, own_hz = _measure_own_impacts(study, hz, 2), study.find_own_hz(hz)
     if impacts is None or own_hz is None:
-        return Finding("one impact a side", DEPARTS)
+        return ModelFinding("one impact a side", DEPARTS)
     force = impacts.peaks_n[1] / impacts.peaks_n[0]
     duration = impacts.durations_s[1] / impacts.durations_s[0]
-    return Finding(
+    return ModelFinding(
         f"{impacts.peaks_n[1]:.0f} N after {impacts.peaks_n[0]:.0f} N ({100 * force:.0f} %), "
         f"{1e3 * impacts.durations_s[1]:.0f} ms after {1e3 * impacts.durations_s[0]:.0f} ms "
         f"({100 * duration:.0f} %), at its own resonance",
@@ -484,12 +486,12 @@ def _compare_second_impact(study: PaperStudy) -> Finding:
     )
 
 
-def _compare_three_impacts(study: PaperStudy) -> Finding:
+def _compare_three_impacts(study: PaperStudy) -> ModelFinding:
     case, hz = study.cases["G4"], SECONDARY_HZ[0]
     settled = case.simulator.sweep([hz], case.acceleration, findings.SETTLE_CYCLES).states[0]
     chaotic = low_frequency.measure_impact_sequence(case, hz, settled, 3)
     peaks_n = chaotic.peaks_n if chaotic else []
-    return Finding(
+    return ModelFinding(
         f"mean peak forces {_list(peaks_n, '.0f')} N over the cycles with three"
         if peaks_n
         else "no cycle with three impacts",
@@ -498,7 +500,7 @@ def _compare_three_impacts(study: PaperStudy) -> Finding:
     )
 
 
-def _compare_directions(study: PaperStudy) -> Finding:
+def _compare_directions(study: PaperStudy) -> ModelFinding:
     """Compare forward and backward curves in the middle of each left hysteresis of G4."""
     scan, case = study.secondary["G4"], study.cases["G4"]
     differences = []
@@ -510,7 +512,7 @@ def _compare_directions(study: PaperStudy) -> Finding:
         ]
         differences.append(abs(excursions[0] - excursions[1]) / max(excursions))
     largest = max(differences, default=0.0)
-    return Finding(
+    return ModelFinding(
         f"in the left hystereses η_a differs by {100 * min(differences):.0f} to "
         f"{100 * largest:.0f} % of the larger one"
         if differences
@@ -520,7 +522,7 @@ def _compare_directions(study: PaperStudy) -> Finding:
     )
 
 
-def _count_irregular_impacts(study: PaperStudy) -> Finding:
+def _count_irregular_impacts(study: PaperStudy) -> ModelFinding:
     distribution = study.impacts[IRREGULAR_HZ]
     share = distribution.share((1, 2), (2, 1))
     side = "right" if distribution.share((2, 1)) > distribution.share((1, 2)) else "left"
@@ -530,7 +532,7 @@ def _count_irregular_impacts(study: PaperStudy) -> Finding:
             f" (from rest: {side} twice); by symmetry the mirror attractor coexists, and the "
             "initial conditions decide the side"
         )
-    return Finding(
+    return ModelFinding(
         f"one side twice, the other once in {100 * share:.0f} % of the cycles{note}",
         _judge(share > 0.5),
         {"twice_once_share": share},
@@ -543,24 +545,24 @@ def format_uncertain(value: float, error: float) -> str:
     return f"{value:+.{digits}f}({round(error * 10**digits)})".replace("-", "−")
 
 
-def _find_chaotic_bands(study: PaperStudy) -> Finding:
+def _find_chaotic_bands(study: PaperStudy) -> ModelFinding:
     bands = findings.find_bands(CHAOS_SCAN_HZ, study.exponents)
     irregular = [(low, high) for low, high in bands if high > 1 and low < MAX_CHAOTIC_HZ]
     is_within = all(low > 1 and high < MAX_CHAOTIC_HZ for low, high in irregular)
     intervals = ", ".join(f"{low:.3f} to {high:.3f}" for low, high in bands)
-    return Finding(
+    return ModelFinding(
         f"chaotic at {intervals} Hz" if bands else "nowhere chaotic",
         _judge(bool(irregular) and is_within),
         {"bands_hz": bands},
     )
 
 
-def _measure_chaos(study: PaperStudy) -> Finding:
+def _measure_chaos(study: PaperStudy) -> ModelFinding:
     measures = [study.chaos[hz] for hz in (*SECONDARY_HZ, IRREGULAR_HZ)]
     exponents = [measure.exponent for measure in measures]
     errors = [measure.error for measure in measures]
     is_chaotic = min(exponents) > 0
-    return Finding(
+    return ModelFinding(
         "largest Lyapunov exponents "
         + ", ".join(map(format_uncertain, exponents, errors))
         + " per cycle at 0.53, 0.71, 1.1, 1.4 Hz, with standard errors: "
@@ -574,9 +576,9 @@ def _measure_chaos(study: PaperStudy) -> Finding:
     )
 
 
-def _measure_scatter(study: PaperStudy) -> Finding:
+def _measure_scatter(study: PaperStudy) -> ModelFinding:
     scatters = [study.chaos[hz].scatter for hz in SECONDARY_HZ]
-    return Finding(
+    return ModelFinding(
         "standard deviation of η_d over cycles "
         + ", ".join(f"{100 * scatter:.1f} %" for scatter in scatters)
         + " at 0.53, 0.71, 1.1 Hz, like the exponents largest at "
@@ -586,11 +588,11 @@ def _measure_scatter(study: PaperStudy) -> Finding:
     )
 
 
-def _find_zero_gap_resonance(study: PaperStudy) -> Finding:
+def _find_zero_gap_resonance(study: PaperStudy) -> ModelFinding:
     sweep = study.slow_sweeps["G0"]
     is_single_curve = sweep.max_difference < MAX_DIRECTION_DIFFERENCE
     is_close = abs(sweep.peak_hz / ZERO_GAP_HZ - 1) < FREQUENCY_TOLERANCE
-    return Finding(
+    return ModelFinding(
         f"{sweep.peak_hz:.2f} Hz ({_format_difference(sweep.peak_hz, ZERO_GAP_HZ)}), "
         + ("none" if is_single_curve else "hysteresis"),
         _judge(is_single_curve and is_close),
@@ -598,9 +600,9 @@ def _find_zero_gap_resonance(study: PaperStudy) -> Finding:
     )
 
 
-def _measure_zero_gap_flight(study: PaperStudy) -> Finding:
+def _measure_zero_gap_flight(study: PaperStudy) -> ModelFinding:
     flight = findings.measure_zero_gap_flight(study.cases["G0"], ZERO_GAP_HZ)
-    return Finding(
+    return ModelFinding(
         f"{100 * flight.share:.1f} % of the time in flight, {100 * flight.elastic_share:.1f} % "
         "with a tenth of C_j",
         _judge(0 < flight.share < 0.05 and flight.elastic_share < flight.share / 5),
@@ -608,21 +610,21 @@ def _measure_zero_gap_flight(study: PaperStudy) -> Finding:
     )
 
 
-def _measure_release(study: PaperStudy) -> Finding:
+def _measure_release(study: PaperStudy) -> ModelFinding:
     remaining = findings.measure_zero_gap_flight(study.cases["G0"], ZERO_GAP_HZ).remaining
-    return Finding(
+    return ModelFinding(
         f"{100 * remaining:.1f} % of the largest deformation left at release",
         _judge(remaining < 0.1),
         {"remaining": remaining},
     )
 
 
-def _find_softening(study: PaperStudy) -> Finding:
+def _find_softening(study: PaperStudy) -> ModelFinding:
     fold = study.folds["G-1"]
     if fold is None:
-        return Finding(NO_HYSTERESIS, DEPARTS, {"from_hz": np.nan, "to_hz": np.nan})
+        return ModelFinding(NO_HYSTERESIS, DEPARTS, {"from_hz": np.nan, "to_hz": np.nan})
     low, high, is_left = fold.backward_hz, fold.forward_hz, fold.kind == "left"
-    return Finding(
+    return ModelFinding(
         f"{fold.kind} hysteresis, {low:.3f} to {high:.3f} Hz "
         f"({_format_difference((low + high) / 2, 6.0)}; {fold.method})",
         _judge(is_left and low < 6 < high, is_left),
@@ -630,7 +632,7 @@ def _find_softening(study: PaperStudy) -> Finding:
     )
 
 
-def _find_forward_contact(study: PaperStudy) -> Finding | None:
+def _find_forward_contact(study: PaperStudy) -> ModelFinding | None:
     """Find whether the forward motion in the hysteresis of G-1 stays in contact; None without."""
     case, fold = study.cases["G-1"], study.folds["G-1"]
     if fold is None:
@@ -639,7 +641,7 @@ def _find_forward_contact(study: PaperStudy) -> Finding | None:
     precompression_mm = -1e3 * case.parameters.gap_r
     amplitude_mm = 1e3 * findings.steady_amplitude_m(case, study.slow_sweeps["G-1"], hz, "forward")
     stays = amplitude_mm <= precompression_mm
-    return Finding(
+    return ModelFinding(
         f"amplitude {amplitude_mm:.3f} mm, pre-strain {precompression_mm:g} mm: "
         + ("always in contact" if stays else "it leaves each bumper for a moment"),
         _judge(stays),
@@ -648,12 +650,12 @@ def _find_forward_contact(study: PaperStudy) -> Finding | None:
     )
 
 
-def _find_small_precompression(study: PaperStudy) -> Finding:
+def _find_small_precompression(study: PaperStudy) -> ModelFinding:
     fold, sweep = study.folds["G-2"], study.slow_sweeps["G-2"]
     low, high = (fold.backward_hz, fold.forward_hz) if fold else (np.nan, np.nan)
     detaches = findings.detaches(study.cases["G-2"], -2.0)
     position = f"{sweep.peak_hz:.2f} Hz ({_format_difference(sweep.peak_hz, 7.3)})"
-    return Finding(
+    return ModelFinding(
         f"detaches, {fold.kind} hysteresis {low:.3f} to {high:.3f} Hz, largest η_d at {position}"
         if fold and detaches
         else position,
@@ -662,12 +664,12 @@ def _find_small_precompression(study: PaperStudy) -> Finding:
     )
 
 
-def _find_large_precompression(study: PaperStudy) -> Finding:
+def _find_large_precompression(study: PaperStudy) -> ModelFinding:
     sweep = study.slow_sweeps["G-10"]
     detaches = findings.detaches(study.cases["G-10"], -10.0)
     stays = sweep.max_difference < MAX_DIRECTION_DIFFERENCE and not detaches
     is_close = abs(sweep.peak_hz / 7.6 - 1) < FREQUENCY_TOLERANCE
-    return Finding(
+    return ModelFinding(
         f"{sweep.peak_hz:.2f} Hz ({_format_difference(sweep.peak_hz, 7.6)}), "
         + ("never detaches, no hysteresis" if stays else "detaches"),
         _judge(stays and is_close, stays),
@@ -675,26 +677,26 @@ def _find_large_precompression(study: PaperStudy) -> Finding:
     )
 
 
-def _find_overlap(study: PaperStudy) -> Finding:
+def _find_overlap(study: PaperStudy) -> ModelFinding:
     curves = (study.slow_sweeps[name].eta_d for name in ("G-10", "G-2"))
     first, second = curves
     difference = max(_relative_difference(first[d], second[d]) for d in DIRECTIONS)
-    return Finding(
+    return ModelFinding(
         f"η_d differs by up to {100 * difference:.0f} % of G-10's peak: G-2 still detaches",
         _judge(difference < MAX_CURVE_DIFFERENCE),
         {"difference": difference},
     )
 
 
-def _find_permanent_contact(study: PaperStudy) -> Finding:
+def _find_permanent_contact(study: PaperStudy) -> ModelFinding:
     case = study.cases["G-10"]
     gap = findings.find_permanent_contact_mm(case)
     if np.isnan(gap):
         text = f"not between 0 and {findings.MIN_GAP_MM:g} mm".replace("-", "−")
-        return Finding(text, DEPARTS)
+        return ModelFinding(text, DEPARTS)
     detachments = [findings.detaches(case, gap + step) for step in (0.015, -0.015)]
     is_confirmed = detachments == [True, False]
-    return Finding(
+    return ModelFinding(
         f"G = {gap:.3f} mm".replace("-", "−")
         + ("; a sweep 15 µm to either side confirms it" if is_confirmed else ""),
         _judge(-2 <= gap <= -1),
@@ -702,7 +704,7 @@ def _find_permanent_contact(study: PaperStudy) -> Finding:
     )
 
 
-FINDINGS: dict[str, Callable[[PaperStudy], Finding | None]] = {
+FINDINGS: dict[str, Callable[[PaperStudy], ModelFinding | None]] = {
     "eta_definition": _compare_definition,
     "free_flight": _find_free_flight,
     "g30": partial(_find_hardening, name="G30"),

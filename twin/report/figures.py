@@ -14,9 +14,8 @@ from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block
 from table_io.units import GRAVITY_M_S2
-from twin.drawing.branch_curves import FREE_QUANTITIES
+from twin.drawing.branch_curves import FREE_QUANTITIES, BranchSet
 from twin.drawing.branch_figures import branch_handles, plot_branches
-from twin.drawing.model_branches import follow_model_branches
 from twin.drawing.motion_drawing import draw_rest_lines
 from twin.drawing.orbit_figure import draw_orbits
 from twin.drawing.plot_style import (
@@ -48,6 +47,7 @@ from twin.drawing.prc_drawing import (
 from twin.drawing.step_figures import draw_histories, draw_legend, draw_loop_figures
 from twin.drawing.table_motion_figures import draw_table_motion
 from twin.drawing.window_figure import draw_window_histories
+from twin.dynamics.main_branches import follow_sweep_branches
 from twin.results.report_data import (
     DIRECTIONS,
     IMPACT_KEYS,
@@ -56,6 +56,7 @@ from twin.results.report_data import (
     compute_prestress,
     compute_step_errors,
     extract_prc,
+    read_initial_model,
 )
 
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
@@ -134,7 +135,7 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
 
 def _draw_model_branches(run: ReportData) -> CaptionedFigures:
     """Draw the points over the model's branches, stable and unstable, between the jumps."""
-    branches, stars = follow_model_branches(run), run.summary.stars
+    branches, stars = _follow_model_branches(run), run.summary.stars
     if branches is None or stars is None:
         return
     scales = dict(zip(("eta_d", "eta_a"), stars, strict=True))
@@ -160,6 +161,19 @@ def _draw_model_branches(run: ReportData) -> CaptionedFigures:
         "separates the starts that lead to the one and to the other stable motion.",
         figure,
     )
+
+
+def _follow_model_branches(run: ReportData) -> BranchSet | None:
+    """Follow the main branches of the model over the steps of a run; None without any."""
+    model, steps = read_initial_model(run), run.recording.start.steps
+    if model is None or run.summary.stars is None:
+        return None
+    branches = follow_sweep_branches(
+        model,
+        (step.frequency_hz for step in steps),
+        (step.acceleration_m_s2 for step in steps),
+    )
+    return BranchSet(branches) if branches else None
 
 
 def _dotted_style(direction: str) -> LineStyle:

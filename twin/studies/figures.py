@@ -36,7 +36,7 @@ from twin.drawing.plot_style import (
 )
 from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_panels, plot_prc
 from twin.results.report_data import Curve
-from twin.studies.cases import format_gap_mm
+from twin.studies.batch import format_gap_mm
 from twin.studies.result import CaseSummary, Row, SweepSummary
 
 Curves = dict[str, list[Row]]  # direction -> rows in ascending frequency

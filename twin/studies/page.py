@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from twin.drawing.page import embed_images, render_page
+from twin.drawing.page import embed_images, write_page
 from twin.studies import TABLE_FILE
-from twin.studies.cases import format_gap_mm
+from twin.studies.batch import format_gap_mm
 from twin.studies.result import REMEDY, SweepSummary, read_batch_rows
 
 
@@ -14,12 +14,10 @@ def write_study_page(folder: Path) -> Path:
 
     summary = SweepSummary.read(folder / "summary.json", REMEDY)
     pictures = draw_study_figures(read_batch_rows(folder / TABLE_FILE), summary, folder / "figures")
-    path = folder / "report.html"
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("batch.html"),
         summary=summary,
         images=embed_images(pictures),
         format_gap=format_gap_mm,
     )
-    path.write_text(text, encoding="utf-8")
-    return path

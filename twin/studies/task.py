@@ -15,8 +15,15 @@ from twin.setup.folders import make_run_folder
 from twin.setup.run_config import read_run_config
 from twin.setup.warm_up import COMPILING_MESSAGE
 from twin.studies import TABLE_FILE
-from twin.studies.batch import Batch, CaseResult, read_batch, simulate_case
-from twin.studies.cases import StudyCase, parse_gaps_mm, read_models
+from twin.studies.batch import (
+    Batch,
+    CaseResult,
+    StudyCase,
+    parse_gaps_mm,
+    read_batch,
+    read_models,
+    simulate_case,
+)
 from twin.studies.page import write_study_page
 from twin.studies.result import BatchTable, CaseSummary, ModelText, SweepRun, SweepSummary
 from twin.system.grid import Watch, run_grid

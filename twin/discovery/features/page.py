@@ -17,7 +17,7 @@ from twin.discovery.features.search import FeatureDiscovery, describe_effects
 from twin.discovery.features.task import FeatureModel
 from twin.discovery.result import FeatureVerdict, label_feature, name_fit
 from twin.discovery.words import format_interval, name_effect
-from twin.drawing.page import embed_images, render_page
+from twin.drawing.page import embed_images, write_page
 from twin.drawing.plot_style import CaptionedFigure, Picture, save_figures
 from twin.laws.library import find_effect
 from twin.laws.typesetting import typeset_law
@@ -43,7 +43,8 @@ def write_features_page(folder: Path, result: FeatureModel) -> Path:
     pairs = _draw_pairs(discovery, content, folder / "figures")
     light, dark = (embed_images(pair[side] for pair in pairs) for side in (0, 1))
     best = content.best_fit
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("page.html"),
         content=content,
         headline=format_features_headline(content),
@@ -51,15 +52,11 @@ def write_features_page(folder: Path, result: FeatureModel) -> Path:
         name=name_fit,
         label=label_feature,
         quantity=format_interval,
-        laws=[(typeset_law(find_effect(id).term), find_effect(id).residual)
-              for id in content.best],
+        laws=[(typeset_law(find_effect(id).term), find_effect(id).residual) for id in content.best],
         terms=describe_effects,
         pictures=list(zip(light, dark, strict=True)),
         model=result.model_toml,
-    )  # fmt: skip
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
+    )
 
 
 def format_features_headline(content: FeatureVerdict) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Float2D
-from twin.drawing.page import embed_images, render_page
+from twin.drawing.page import embed_images, write_page
 from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.results import StudyResults, format_plain, format_unit
@@ -29,7 +29,8 @@ def write_map_page(folder: Path) -> Path:
     study, manifest = results.study, results.manifest
     config = study.config
     failures = manifest.failures
-    text = render_page(
+    return write_page(
+        folder,
         Path(__file__).with_name("map.html"),
         config=config,
         state=find_state(results),
@@ -49,9 +50,6 @@ def write_map_page(folder: Path) -> Path:
         model_toml=study.model_toml,
         profile_toml=study.profile_toml,
     )
-    path = folder / "report.html"
-    path.write_text(text, encoding="utf-8")
-    return path
 
 
 def find_state(results: StudyResults) -> str:

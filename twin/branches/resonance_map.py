@@ -1,9 +1,10 @@
-"""Figures of a resonance map: loci of folds and grazings, and the largest motion over a parameter.
+"""Page, tables and figures of a resonance map over a parameter.
 
-The design question of the paper: which gap keeps the displacement small, and which the
-acceleration.
+Loci of folds and grazings, and the largest motion: the design question of the paper, which gap
+keeps the displacement small, and which the acceleration.
 """
 
+import csv
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from table_io.block import Float1D
 from twin.drawing.branch_curves import Axis, make_axis
+from twin.drawing.page import embed_images, write_page
 from twin.drawing.plot_style import (
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
@@ -99,3 +101,67 @@ def _draw_peak(ax: Axes, x: Float1D, y: Float1D, axis: Axis) -> None:
             (0, offset), textcoords="offset points", ha="right" if right else "left",
             color=GUIDE_COLOUR,
         )  # fmt: skip
+
+
+def write_map_report(
+    folder: Path, resonance: ResonanceMap, title: str, subtitle: str, model_toml: str
+) -> Path:
+    """Write report.html, peaks.csv, loci.csv and figures/*.png to `folder`.
+
+    Return the path of the page. The tables are in SI.
+    """
+    pictures = draw_map_figures(resonance, folder / "figures")
+    write_tables(resonance, folder)
+    axis, peaks = make_axis(resonance.parameter), resonance.peaks
+    columns = (
+        axis.factor * peaks.values, 1e3 * peaks.u_m, peaks.u_hz, peaks.a_m_s2, peaks.a_hz
+    )  # fmt: skip
+    return write_page(
+        folder,
+        Path(__file__).with_name("map.html"),
+        title=title,
+        subtitle=subtitle,
+        headline=format_map_headline(resonance),
+        parameter=axis.label,
+        rows=np.column_stack(columns).tolist(),
+        images=embed_images(pictures),
+        model=model_toml,
+    )
+
+
+def write_tables(resonance: ResonanceMap, folder: Path) -> None:
+    """Write peaks.csv and loci.csv, in SI, without loss of precision."""
+    name, peaks = resonance.parameter, resonance.peaks
+    with (folder / "peaks.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([name, "u_m", "u_frequency_hz", "a_m_s2", "a_frequency_hz"])
+        writer.writerows(
+            np.column_stack(
+                (peaks.values, peaks.u_m, peaks.u_hz, peaks.a_m_s2, peaks.a_hz)
+            ).tolist()
+        )
+    with (folder / "loci.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["locus", "kind", "frequency_hz", name])
+        for number, locus in enumerate(resonance.loci, 1):
+            writer.writerows([number, locus.kind, *place] for place in locus.values.tolist())
+
+
+def format_map_headline(resonance: ResonanceMap) -> str:
+    """State where the largest displacement and acceleration are least, in one sentence."""
+    axis, peaks = make_axis(resonance.parameter), resonance.peaks
+    parts = []
+    for label, unit, y in (
+        ("displacement", "mm", 1e3 * peaks.u_m),
+        ("total acceleration", "m/s²", peaks.a_m_s2),
+    ):
+        if not np.isfinite(y).any():
+            continue
+        least, most = int(np.nanargmin(y)), int(np.nanargmax(y))
+        x = axis.factor * peaks.values
+        parts.append(
+            f"the largest {label} is least, {y[least]:.3g} {unit}, at {x[least]:.4g} and "
+            f"most, {y[most]:.3g} {unit}, at {x[most]:.4g}"
+        )
+    text = "; ".join(parts) or "no stable motion is known"
+    return f"{text[0].upper()}{text[1:]} ({axis.label})."
