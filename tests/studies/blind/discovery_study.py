@@ -37,16 +37,12 @@ from tests.studies.blind.scoring import (
     score_verdict,
     select_case_facts,
 )
-from twin.discovery.build_verdict import build_interval, build_parameter, build_verdict
-from twin.discovery.cross_checks import fitted_gap
+from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import PreparedLog, discover_effects, fit_known_effects
-from twin.discovery.identify import identify_parameters
-from twin.discovery.loading import load_recordings
-from twin.discovery.parameters import GapKey
 from twin.discovery.signals import LogSignals
+from twin.discovery.task import identify
 from twin.model.model import Model
 from twin.results.contract import format_json
-from twin.setup.run_config import read_model_template
 from twin.system.terminal import print_line
 
 Json = dict[str, Any]
@@ -168,29 +164,24 @@ def cover_every_value(estimate: dict[str, Any]) -> dict[str, Any]:
     return estimate
 
 
-def identify_in_case(case_dir: Path) -> dict[str, Any]:
-    """Run identification on the recording of a case; return parameters and gaps with intervals.
+def identify_in_case(case_dir: Path) -> Json:
+    """Return what `identify` states of the recording of a case: parameters and gaps.
 
-    The gap of a side has no interval, as in the output of `identify`.
+    The gap of a side has no interval.
     """
-    (loaded,) = load_recordings([case_dir / "log.mcap"])
-    model = read_model_template(str(case_dir / "model.toml"))[0]
-    result = identify_parameters([loaded.log], [loaded.blocks], model)
-    fit, (residuals,) = result.fit, result.problem.log_residuals
-    sides = {side: fitted_gap(residuals, fit, side) for side in ("right", "left")}
-    sd = 2.0 * fit.std_errors.get(GapKey(0), math.inf)
+    report = identify([case_dir / "log.mcap"], case_dir / "model.toml").report
+    (gap,) = report.gaps.values()
+    total = gap.interval.to_plain() if gap.interval else {"value": gap.right + gap.left}
+    estimates = {name: estimate.to_plain() for name, estimate in report.parameters.items()}
+    sides = {"gap_right": {"value": gap.right}, "gap_left": {"value": gap.left}}
     return {
         "verdict": "identified",
         "parameters": {
-            name: cover_every_value(estimate.to_plain())
-            for name, estimate in (
-                *((free.name, build_parameter(fit, free)) for free in fit.free),
-                ("gap", build_interval(sum(sides.values()), sd, "m")),
-            )
-        }
-        | {f"gap_{side}": {"value": value, "unit": "m"} for side, value in sides.items()},
-        "rms_over_noise": math.sqrt(fit.cost),
-        "warnings": [*result.warnings],
+            **{name: cover_every_value(e) for name, e in (estimates | {"gap": total}).items()},
+            **sides,
+        },
+        "rms_over_noise": report.rms_over_noise,
+        "warnings": report.warnings,
     }
 
 
