@@ -10,6 +10,7 @@ import pytest
 
 from twin.campaign import command, offline, realtime, state
 from twin.campaign.command import CampaignOptions
+from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.campaign.state import read_state
 from twin.live.process_config import ProcessConfig
 
@@ -92,12 +93,31 @@ def record(spec: ProcessConfig) -> None:
     verdict, measured = Players.ends.get(label, ("complete", 6))
     log = Path(spec.folder) / "run.mcap"
     log.write_bytes(f"recorded by {spec.run}".encode())
-    steps = [{"index": k, "measured": {"eta_d": 1.0}} for k in range(profile.first_step, measured)]
+    steps = [
+        {
+            "index": step.index, "direction": step.direction, "frequency_hz": step.frequency_hz,
+            "measured": {"eta_d": 1.0},
+        }
+        for step in profile.steps[profile.first_step : measured]
+    ]  # fmt: skip
     values = {
-        "verdict": verdict, "reason": f"it was {verdict}", "steps": steps, "gaps": 0,
+        "run": {"name": spec.run}, "verdict": verdict, "reason": f"it was {verdict}",
+        "steps": steps, "gaps": 0,
         "sha256": hashlib.sha256(log.read_bytes()).hexdigest(),
     }  # fmt: skip
     (log.parent / "summary.json").write_text(json.dumps(values))
+
+
+def write_bare_summary(folder: Path) -> Path:
+    """Stand in for the report of a campaign: a summary without results, and no page."""
+    summary = CampaignSummary(
+        campaign=CampaignInfo(title="", citation="", notes=""),
+        verdict="",
+        reason="",
+        gap_comparison=None,
+    )
+    summary.write(folder / "summary.json")
+    return folder / "report.html"
 
 
 def prepare_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
@@ -108,7 +128,7 @@ def prepare_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(Players, "ends", {})
     monkeypatch.setattr(Players, "given", [])
     for room in (command, realtime):
-        monkeypatch.setattr(room, "write_campaign_report", lambda folder: folder / "report.html")
+        monkeypatch.setattr(room, "write_campaign_report", write_bare_summary)
     for room in (offline, realtime):
         monkeypatch.setattr(room, "format_run_end", lambda *_: "ended")
     monkeypatch.setattr(command, "compile_kernels", lambda *_, **__: None)
