@@ -63,7 +63,7 @@ def test_visits_stand_beside_the_steps_with_their_reasons(run: tuple) -> None:
     assert summary.findings == [detected]
     assert "6 cycles held in 2 visits" in format_summary(summary, 2)
     shown = build_report_data(recording, summary)
-    assert extract_prc(shown.points, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
+    assert extract_prc(shown.steps, "measured", "forward", "eta_d")[0].tolist() == [3.8, 4.0]
     assert format_headline(shown).startswith("2 of 2 steps")
     assert detected in format_headline(shown)
     assert len(bundle.steps) == 2

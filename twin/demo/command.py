@@ -39,7 +39,6 @@ from twin.laws.library import find_effect
 from twin.live.run_command import run_test
 from twin.results.contracts import RunSummary
 from twin.results.report_data import extract_prc
-from twin.results.summary import prc_points
 from twin.results.twin_verdict import format_misfit
 from twin.setup.folders import make_output_folder, make_run_folder
 from twin.system.files import open_in_browser
@@ -271,12 +270,11 @@ def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
     runs = {"first run, model as it was": before, "second run, effect added": after}
     panels = figure.subplots(1, len(runs), sharex=True, sharey=True)
     for panel, (title, run) in zip(panels, runs.items(), strict=True):
-        points = prc_points(run.summary.steps)
         for source, jumps, make_style in (
             ("measured", run.summary.jumps, _rig_style),
             ("twin", run.summary.twin_jumps, _twin_style),
         ):
-            curves = break_at_jumps(partial(extract_prc, points, source), jumps)
+            curves = break_at_jumps(partial(extract_prc, run.summary.steps, source), jumps)
             plot_prc([(panel, {"eta_d": 1})], curves, make_style)
         panel.set_title(f"{title}: twin error {100 * run.error:.2g} %")
         panel.set_xlabel("frequency of the table in Hz")

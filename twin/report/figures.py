@@ -96,7 +96,7 @@ def draw_figures(run: ReportData) -> CaptionedFigures:
 
 def _draw_prc(run: ReportData) -> CaptionedFigures:
     """Draw the pseudo-resonance curves (Figs. 2 and 11)."""
-    measured, twin = (partial(extract_prc, run.points, source) for source in ("measured", "twin"))
+    measured, twin = (partial(extract_prc, run.steps, source) for source in ("measured", "twin"))
     curves = measured if run.source == "measured" else twin
     if not any(np.isfinite(curves(direction, "eta_d")[1]).any() for direction in DIRECTIONS):
         return
@@ -148,7 +148,7 @@ def _draw_model_branches(run: ReportData) -> CaptionedFigures:
         plot_branches(ax, branches, quantity, scale=quantity.si / scales[name])
         ax.set_ylabel(label)
         for direction in DIRECTIONS:
-            f, y = extract_prc(run.points, run.source, direction, name)
+            f, y = extract_prc(run.steps, run.source, direction, name)
             style = {**_dotted_style(direction), "ls": ""}
             ax.plot(f, y, zorder=1.5, label=f"{run.source} {direction}", **style)
     handles = [*axes[0, 0].get_legend_handles_labels()[0], *branch_handles(branches)]
@@ -185,10 +185,10 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
     directions = [
         direction
         for direction in DIRECTIONS
-        if extract_prc(run.points, run.source, direction, IMPACT_KEYS[0])[0].size
+        if extract_prc(run.steps, run.source, direction, IMPACT_KEYS[0])[0].size
     ]
     counts = [
-        extract_prc(run.points, run.source, direction, side)[1]
+        extract_prc(run.steps, run.source, direction, side)[1]
         for direction in directions
         for side in IMPACT_KEYS
     ]
@@ -198,10 +198,10 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
     rows = figure.subplots(len(directions), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
     for ax, direction in zip(rows, directions, strict=True):
         for side, sign in zip(IMPACT_KEYS, (1, -1), strict=True):
-            f, y = extract_prc(run.points, "measured", direction, side)
+            f, y = extract_prc(run.steps, "measured", direction, side)
             ax.vlines(f, 0, sign * y, color=DIRECTION_COLOURS[direction], lw=3, alpha=0.35)
             ax.plot(f, sign * y, "o", color=DIRECTION_COLOURS[direction])
-            f, y = extract_prc(run.points, "twin", direction, side)
+            f, y = extract_prc(run.steps, "twin", direction, side)
             ax.plot(f, sign * y, "o", ms=6.5, mfc="none", mec=TWIN_COLOUR, mew=0.8)
         ax.set_ylabel("impacts per cycle")
         ax.set_title(direction)

@@ -26,7 +26,6 @@ from twin.drawing.prc_drawing import (
 from twin.report.run_comparison import ComparedRun, RunComparison
 from twin.results.quantities import format_quantity
 from twin.results.report_data import DIRECTIONS, extract_prc
-from twin.results.summary import prc_points
 from twin.results.twin_verdict import CHANNEL_SYMBOLS
 
 RUN_COLOURS = ("#c8741a", "#0f7b7b")  # first, second: neither is that of a direction
@@ -53,7 +52,7 @@ def write_comparison_page(
 
 def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures:
     """Draw the curves of two runs over each other: measured wide and pale, twin thin on top."""
-    points = [prc_points(run.summary.steps) for run in (first, second)]
+    points = [run.summary.steps for run in (first, second)]
     if not any(points):
         return
     has_bumpers = any(

@@ -20,8 +20,6 @@ from pydantic import (
 
 from table_io.errors import InputError
 
-Json = dict[str, Any]
-
 
 def declare_unit(unit: str) -> Any:
     """Return the annotation that adds a unit to the schema of a number."""

@@ -6,7 +6,6 @@ Also selects the steps that are shown in detail.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
 
 import numpy as np
 from pydantic import ValidationError
@@ -22,9 +21,10 @@ from twin.recording.reader import Recording
 from twin.results.contracts import OrbitResult, RunSummary, StepEntry, WindowResult
 from twin.results.players import SystemMotion
 from twin.results.rerun import restore_predictions
-from twin.results.summary import parse_toml_tables, prc_points
+from twin.results.summary import parse_toml_tables
 
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
+CurvePoint = PrcPoint | StepEntry  # as recorded or simulated, or of a summary
 Envelope = tuple[Float1D, Float1D, Float1D]
 DIRECTIONS = ("forward", "backward")
 IMPACT_KEYS = ("impacts_right", "impacts_left")
@@ -50,10 +50,6 @@ class ReportData:
     @property
     def steps(self) -> Sequence[StepEntry]:
         return self.summary.steps
-
-    @cached_property
-    def points(self) -> list[PrcPoint]:
-        return prc_points(self.steps)
 
     @property
     def source(self) -> str:
@@ -110,14 +106,14 @@ def build_report_data(recording: Recording, summary: RunSummary) -> ReportData:
     return ReportData(recording, summary, streams, specimen, contact_n)
 
 
-def step_quantity(step: StepEntry | PrcPoint, source: str, name: str) -> float:
+def step_quantity(step: CurvePoint, source: str, name: str) -> float:
     """Return a quantity of a step, averaged if given per cycle; NaN if absent."""
     response = getattr(step, source)
     value = math.nan if response is None else getattr(response, name)
     return float(np.mean(value)) if np.size(value) else math.nan
 
 
-def extract_prc(points: Sequence[PrcPoint], source: str, direction: str, name: str) -> Curve:
+def extract_prc(points: Sequence[CurvePoint], source: str, direction: str, name: str) -> Curve:
     """Return (frequency in Hz, quantity), (point,) each, of one direction in ascending frequency.
 
     `source` is "twin" or "measured". Impacts are means per cycle. NaN where there is no value, and

@@ -4,6 +4,7 @@ import math
 import tomllib
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import asdict, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -81,6 +82,7 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
     twin_jumps, twin_intervals = detect_hysteresis(planned, "twin")
     levels = recording.records(Level)
     noise = find_channel_noise(recording)
+    channels = read_channels(start.rig_toml)
     clipped = find_clipped_cycles(recording)
     agreement = summarise_agreement(
         recording,
@@ -149,17 +151,14 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
         twin_jumps=make_jumps(twin_jumps),
         twin_hysteresis=make_intervals(twin_intervals),
         timing=summarise_timing(recording.records(Timing)),
-        comparison=channel_nrmse(
-            recording.records(Comparison),
-            parameters,
-            read_channels(start.rig_toml),
-            noise,
-        ),
+        comparison=channel_nrmse(recording.records(Comparison), parameters, channels, noise),
         estimates=_list_estimates(recording.records(Estimate)),
         warnings=_list_warnings(recording, clipped),
     )
     if not start.steps:
-        _add_history(summary, recording, parameters, profile, noise)
+        compare = partial(channel_nrmse, parameters=parameters, channels=channels, noise=noise)
+        summary.windows = summarise_windows(recording, profile.comparison.contact_n, compare)
+        summary.tracking = summarise_tracking(recording, profile)
     if profile.continuation is not None:
         plan = profile.continuation.orbit_plan
         summary.orbits = summarise_orbits(recording, plan)
@@ -235,23 +234,6 @@ def _find_normalisation(
     u_star, a_star, peak_hz = free_flight_resonance(parameters, level)
     text = "u* and a* are the maxima of the model in free flight, continuous in frequency"
     return u_star, a_star, f"{text} (at {peak_hz:.3f} Hz, {level:.4g} m/s2)"
-
-
-def _add_history(
-    summary: RunSummary,
-    recording: Recording,
-    parameters: Parameters,
-    profile: Profile,
-    noise: ChannelNoise,
-) -> None:
-    """Add windows and tracking error of a displacement history."""
-    channels = read_channels(recording.start.rig_toml)
-
-    def compare(comparisons: tuple[Comparison, ...]) -> dict[str, ChannelError]:
-        return channel_nrmse(comparisons, parameters, channels, noise)
-
-    summary.windows = summarise_windows(recording, profile.comparison.contact_n, compare)
-    summary.tracking = summarise_tracking(recording, profile)
 
 
 def _list_estimates(estimates: tuple[Estimate, ...]) -> dict[str, ParameterEstimate]:

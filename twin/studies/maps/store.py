@@ -180,12 +180,12 @@ def read_study_versions() -> dict[str, str]:
 def require_same_study(folder: Path, study: Study) -> None:
     """Raise InputError unless the study in a folder is this one, of the same versions."""
     stored, new = read_definition(folder), make_definition(study)
-    for name, was, now in (
+    for name, stored_text, new_text in (
         ("study file", stored.study_toml, new.study_toml),
         ("test", stored.profile_toml, new.profile_toml),
         ("model", stored.model_toml, new.model_toml),
     ):
-        if was != now:
+        if stored_text != new_text:
             raise InputError(
                 f"the {name} has changed since the study was started",
                 where=folder,
