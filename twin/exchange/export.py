@@ -9,7 +9,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from table_io.errors import InputError, require_package
+from table_io.formats.text import write_csv
 from table_io.records import RunStart
+from twin.exchange.foxglove import build_layout, write_foxglove
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
 from twin.results.recordings import open_recording
@@ -119,8 +121,6 @@ def _remove_if_empty(folder: Path) -> None:
 def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
     """Write the rows to a new file; imports the library of the format."""
     if kind == "csv":
-        from table_io.formats.text import write_csv
-
         with _open_new(path, "x", encoding="utf-8", newline="") as file:
             write_csv(rows.units, rows.iter_windows(), file)
         return
@@ -140,15 +140,11 @@ def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
             columns = (rows.read_columns(slice(None), name) for name in rows.units)
             write_mat(rows.units, columns, facts, file)
         else:
-            from twin.exchange.foxglove import write_foxglove
-
             write_foxglove(rows, file)
 
 
 def _write_layout(rows: LogTable, path: Path) -> None:
     """Write the layout of Foxglove for the rows to a new file."""
-    from twin.exchange.foxglove import build_layout
-
     with _open_new(path, "x", encoding="utf-8") as file:
         file.write(build_layout(rows))
 

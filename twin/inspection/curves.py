@@ -6,7 +6,6 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
-from twin.campaign.summary import read_campaign
 from twin.report.prc_table import print_prc
 from twin.results.contract import format_json
 from twin.results.contracts import RunSummary
@@ -37,6 +36,8 @@ def read_curves(log: str | Path) -> RecordedCurves:
     """
     log = Path(log)
     if (log / STATE_FILE).is_file():
+        from twin.campaign.summary import read_campaign  # it draws
+
         runs = (run.summary for run in read_campaign(log).runs if run.profile.steps)
         return RecordedCurves(tuple(runs), is_campaign=True)
     recording = open_recording(log)

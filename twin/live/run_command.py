@@ -6,6 +6,7 @@ from pathlib import Path
 
 from table_io.clock import RealClock
 from twin.log import Log, open_log
+from twin.recording.merge import merge_run_parts
 from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, print_outcome, write_results
 from twin.security.credentials import Credentials, credentials_folder
 from twin.setup.disk import require_disk_space
@@ -112,7 +113,6 @@ def _run_live(
     """Run a test in real time; return False if it was interrupted before it began."""
     from twin.live.process_config import ProcessConfig
     from twin.live.supervisor import Supervisor
-    from twin.recording.merge import merge_run_parts
 
     process_config = ProcessConfig(
         run,

@@ -22,6 +22,7 @@ from twin.monitor.app import FRAME_S, LIVE_TOPICS, MonitorClient, connect_observ
 from twin.monitor.page_data import build_sections
 from twin.monitor.page_server import CommandAnswer, PageCommand, PageFeed, open_page_server
 from twin.security.access_control import user_name
+from twin.security.certificate_authority import certificate_hosts
 from twin.security.credentials import (
     CERTIFICATE_FILE,
     Credentials,
@@ -72,8 +73,6 @@ def format_page_url(address: str, access: PageAccess, keys: Credentials | None) 
     """Return the address to open, with the code of the user who starts the page, if any."""
     host, port = split_host_port(f"/{address}")
     if not is_loopback_host(host) and keys is not None:
-        from twin.security.certificate_authority import certificate_hosts
-
         names = certificate_hosts((keys.folder / CERTIFICATE_FILE).read_bytes())
         if host not in names:  # all interfaces, as 0.0.0.0
             host = next((name for name in names if not is_loopback_host(name)), names[0])

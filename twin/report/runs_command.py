@@ -8,7 +8,7 @@ from rich.text import Text
 
 from table_io.errors import InputError, replace_escapes
 from twin.report.finalize import VERDICT_COLOURS
-from twin.report.run_index import RunRow, index_runs
+from twin.report.run_index import RunRow, index_runs, write_run_index
 from twin.results.contract import format_json
 from twin.system.terminal import console, print_line, print_table
 
@@ -21,8 +21,6 @@ def print_runs(folder: Path, as_json: bool, page: Path | None) -> None:
         raise InputError("no such folder", where=folder, remedy="give a folder that holds runs")
     rows = index_runs(folder)
     if page is not None:
-        from twin.report.run_index import write_run_index
-
         write_run_index(rows, page, folder)
     if as_json:
         print(format_json({"runs": [asdict(row) for row in rows]}))

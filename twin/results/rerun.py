@@ -23,6 +23,8 @@ from table_io.records import (
     StepAdded,
     Timing,
 )
+from twin.compare import pipeline
+from twin.compare.pipeline import EVENT_KINDS
 from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
@@ -46,8 +48,6 @@ def rerun_twin(
     Recorded faults of the twin and changes of its parameters are repeated. Blocks have
     `block_samples`, 0 for about a second, and end at each sample of `edges` too.
     """
-    from twin.compare import pipeline  # compiles kernels that are not cached
-
     block_samples = block_samples or round(BLOCK_DURATION_S * recording.start.rate_hz)
     setup = config.prepare_twin(from_rest=recording.start.source == "model")
     setup = pipeline.add_steps(setup, *recording.records(StepAdded))
@@ -98,8 +98,6 @@ def _iter_source(recording: Recording, block_samples: int, edges: list[int]) -> 
 def is_rig_item(item: Item) -> bool:
     """Return whether an item comes from the rig and is copied, not recomputed by the twin."""
     if isinstance(item, Event):
-        from twin.compare.pipeline import EVENT_KINDS
-
         # "divergence" is a twin event kind in old logs
         return item.kind not in (*EVENT_KINDS, "divergence")
     return not isinstance(item, (Block, RunStart, Timing, *TWIN_RECORDS))

@@ -29,7 +29,7 @@ from table_io.records import (
     Timing,
     Trip,
 )
-from twin.compare import COMPARED_CHANNELS
+from twin.compare import COMPARED_CHANNELS, pipeline
 from twin.compare.curves import Hysteresis, PrcJump, detect_hysteresis
 from twin.compare.extra_channels import select_predicted
 from twin.compare.monitoring.cycle import ChannelNoise
@@ -254,8 +254,6 @@ def _collect_points(
     """Return the recorded PRC points; recompute the measured part of those lost to a fault."""
     points = {point.step: point for point in recording.records(PrcPoint)}
     if recording.start.steps and recording.records(Fault):
-        from twin.compare import pipeline
-
         setup = pipeline.prepare_pipeline(profile, Model(parameters), recording.start.steps)
         setup = pipeline.add_steps(setup, *recording.records(StepAdded))
         state, _ = pipeline.start_pipeline(setup)

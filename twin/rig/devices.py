@@ -21,6 +21,7 @@ from table_io.config.plugins import list_entry_points
 from table_io.config.rig import BACKEND_GROUP, RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
+from twin.results.contract import format_json
 from twin.system.terminal import console, print_line, print_table
 
 ANSWER_TIMEOUT_S = 1.8  # for all queries together
@@ -52,8 +53,6 @@ def print_devices(ni: str | None, as_json: bool) -> None:
         if not (name in rig_searches and isinstance(replies[name], InputError))
     }
     if as_json:
-        from twin.results.contract import format_json  # slow import
-
         print(format_json(_to_json(statuses, discovered)))
     else:
         _print_tables(statuses, discovered)

@@ -11,6 +11,7 @@ from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.drive import Drive, Segment
 from table_io.safety.preflight import CORRECTION_HEADROOM, list_limits
 from table_io.units import GRAVITY_M_S2
+from twin.drawing.plot_style import RC_PARAMS
 from twin.setup.run_config import RunConfig
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ def draw_drive(run_config: RunConfig, out: Path) -> Path:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from twin.drawing.plot_style import RC_PARAMS
-
     if not run_config.steps:
         return _draw_history(run_config, out)
     with rc_context(RC_PARAMS):
@@ -68,8 +67,6 @@ def _draw_history(run_config: RunConfig, out: Path) -> Path:
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
-
-    from twin.drawing.plot_style import RC_PARAMS
 
     drive, limits = run_config.drive, list_limits(run_config.rig)[:3]
     count = drive.planned_end

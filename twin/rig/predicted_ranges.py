@@ -21,6 +21,7 @@ from twin.compare.extra_channels import PREDICTED_SUMS, select_predicted
 from twin.model.ideal_response import simulate_sweep
 from twin.model.valid_range import EVENT_KIND, select_first_exits
 from twin.setup.run_config import RunConfig
+from twin.setup.unpaced import generate_ideal_twin
 
 SETTLING_CYCLES = 30  # at each orbit of a continuation
 MAX_RANGE_SHARE = (
@@ -132,8 +133,6 @@ def _simulate_peaks(run_config: RunConfig) -> tuple[dict[str, Float1D], tuple[st
 
     Peaks are (window,).
     """
-    from twin.setup.unpaced import generate_ideal_twin  # with the twin's pipeline, slow to import
-
     specimen, windows = run_config.profile.specimen, run_config.profile.plan.windows
     peaks: dict[str, Float1D] = {}
     range_exits = []

@@ -33,6 +33,7 @@ from twin.security.access_control import (
     ZenohSettings,
     build_people_access,
 )
+from twin.security.certificate_authority import certificate_validity, verify_certificate
 
 AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
     "ca.pem",
@@ -140,8 +141,6 @@ class Credentials:
 def read_credentials(folder: Path) -> Credentials:
     """Read and verify the keys in a folder; raise InputError if they cannot be used."""
     # imported here, so that a run without keys does not load cryptography
-    from twin.security.certificate_authority import certificate_validity, verify_certificate
-
     folder = folder.absolute()
     for name in (AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE):
         if not (folder / name).is_file():

@@ -29,6 +29,7 @@ from table_io.clock import local_datetime
 from table_io.config.base import ConfigModel, parse_toml, read_text
 from table_io.errors import InputError
 from twin.security.access_control import NO_ROLE, user_name
+from twin.security.certificate_authority import certificate_hosts
 from twin.security.credentials import (
     CERTIFICATE_FILE,
     WRITE_BY_OTHERS_MODE_BITS,
@@ -114,8 +115,6 @@ def grant_page_access(host: str, port: int, keys: Credentials | None) -> PageAcc
     """
     is_loopback = is_loopback_host(host)
     if keys is not None and keys.people is not None:
-        from twin.security.certificate_authority import certificate_hosts
-
         names = certificate_hosts((keys.folder / CERTIFICATE_FILE).read_bytes())
         tls = create_tls_context(keys.folder, ssl.PROTOCOL_TLS_SERVER)
         tls.verify_mode = ssl.CERT_NONE  # browsers log in with a code

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from table_io.acquisition.session import SessionSetup
-from table_io.clock import local_datetime
+from table_io.backends import open_backend
+from table_io.clock import ManualClock, local_datetime
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
@@ -18,6 +19,7 @@ from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import StepDemand, check_drive_rig, check_limits, compute_demands
+from table_io.sensor_errors import highpass
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
@@ -228,7 +230,6 @@ def compile_twin_kernels() -> None:
     """Compile or load the kernels of the twin by running them once on a few samples."""
     import numpy as np
 
-    from table_io.sensor_errors import highpass
     from twin.model.closed_form import advance_state, discretized_params, rest_state
 
     parameters = Parameters(550.0, 36e3, 1.1e3, 510e3, 900.0, 510e3, 900.0, 0.002, 0.002)
@@ -249,9 +250,6 @@ def compile_rig_kernels(config: RunConfig) -> None:
     import numpy as np
 
     from table_io.acquisition.session import run_session
-    from table_io.backends import open_backend
-    from table_io.clock import ManualClock
-    from table_io.sensor_errors import highpass
 
     highpass(np.zeros(4), 1.0, 2000.0)  # first called when a cycle is complete
     if not config.rig.runs_at_any_speed:

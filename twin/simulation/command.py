@@ -5,8 +5,11 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign.config import find_campaign
+from twin.campaign.simulate_grid import GapOptions, simulate_grid
 from twin.report.finalize import print_outcome, show_progress
 from twin.simulation.task import simulate
+from twin.studies.command import simulate_all
+from twin.studies.task import SweepOptions
 
 
 def simulate_profile(
@@ -27,8 +30,6 @@ def simulate_profile(
                 where=profile,
                 remedy="omit --gap, --view, --workers and --scheduler, and give one --model",
             )
-        from twin.campaign.simulate_grid import GapOptions, simulate_grid
-
         return simulate_grid(GapOptions(campaign, models[0] if models else None, out))
     if len(models) <= 1 and not gaps:
         if scheduler:
@@ -43,9 +44,6 @@ def simulate_profile(
         raise InputError(
             "shows one run only", where="--view", remedy="omit it, or give one --model and no --gap"
         )
-    from twin.studies.command import simulate_all
-    from twin.studies.task import SweepOptions
-
     return simulate_all(SweepOptions(profile, models, gaps, workers, scheduler, out))
 
 

@@ -1,6 +1,7 @@
 """Backend for a simulated machine in a separate process (`shaketwin table`)."""
 
 from table_io.backends import Backend, BackendDescriptor
+from table_io.backends.machine.client import MachineBackend, check_reachable
 from table_io.backends.machine.protocol import MachineConfig
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
@@ -8,14 +9,10 @@ from table_io.config.rig import RigConfig
 
 
 def _open(rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> Backend:
-    from table_io.backends.machine.client import MachineBackend
-
     return MachineBackend(rig, specimen, rate_hz, clock)
 
 
 def _check_reachable(rig: RigConfig) -> None:
-    from table_io.backends.machine.client import check_reachable
-
     check_reachable(rig)
 
 

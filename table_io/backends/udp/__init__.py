@@ -5,6 +5,7 @@ simulated target in table_io/sim/udp.
 """
 
 from table_io.backends import Backend, BackendDescriptor
+from table_io.backends.udp.backend import UdpBackend
 from table_io.backends.udp.link import UdpWiring, check_reachable
 from table_io.clock import Clock
 from table_io.config.profile import Specimen
@@ -12,8 +13,6 @@ from table_io.config.rig import RigConfig
 
 
 def _open(rig: RigConfig, specimen: Specimen, rate_hz: float, clock: Clock) -> Backend:
-    from table_io.backends.udp.backend import UdpBackend
-
     return UdpBackend(rig, specimen, rate_hz, clock)
 
 
