@@ -109,7 +109,7 @@ def test_what_nuisances_cannot_explain_is_left_to_ideal_instruments() -> None:
     "kind_and_place",
     [
         ("gain", "right"), ("gain", "table_acc_m_s2"), ("lag", "mass_acc_m_s2"),
-        ("resonance", "mass_acc_m_s2"), ("offset1", "mass_disp_m"),
+        ("offset1", "mass_disp_m"),
         ("chebyshev3", "table_disp_m"), ("share", "left"), ("plate", "right"),
         ("cross", "mass_acc_m_s2"), ("gap", ""),
     ],

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Chebyshev
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.least_squares import FitResult, MapFunction
 from twin.discovery.parameters import (
@@ -38,6 +38,7 @@ from twin.discovery.parameters import (
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.discovery.signals import SENSOR_PAIRS, LogSignals
 from twin.discovery.spectra import Spectrum
+from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
 LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
@@ -64,7 +65,6 @@ TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
 TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
 # Share of the change of a parameter due to the nuisances that their assumed forms leave open.
 OPEN_SHARE = 0.005
-GOLDEN_ANGLE = math.pi * (3.0 - math.sqrt(5.0))
 MAX_SIZE = 4.0  # typical sizes; a larger error is a fault, and an effect of its own
 # Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
 TYPICAL_LIMITS: Mapping[str, float] = {
@@ -217,20 +217,13 @@ def linearize_nuisances(
         residuals, signals=signals, nuisances=None, motion_cache=[],
         known_contact=residuals.contact_state,
     )  # fmt: skip
-    before = bare.evaluate_rows(parameters, bare.motion())
-    noise_shares = _compute_noise_shares(bare, parameters, before, mapper)
+    smooth = _smooth_signals(bare, parameters)
+    before = bare.evaluate_rows(parameters, signals.fuse_corrected(smooth))
 
     def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
-        corrected = correct_signals(signals, nuisance, SLOPE_STEP)
+        corrected = correct_signals(smooth, nuisance, SLOPE_STEP)
         rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
-        # A gain or a resonance scales the noise too, so that a large one would seem to reduce the
-        # misfit: the share of the noise in the slope is taken out.
-        slope: Float1D = (rows - before) / SLOPE_STEP
-        if nuisance.kind in ("gain", "resonance"):
-            scaled = SIDES.get(nuisance.place, (nuisance.place,))
-            shares = sum(noise_shares[nuisance.kind, channel] for channel in scaled)
-            slope += nuisance.size * shares * before
-        return slope.astype(np.float32)
+        return ((rows - before) / SLOPE_STEP).astype(np.float32)
 
     kept = [
         (nuisance, column)
@@ -258,44 +251,36 @@ def _add_typical_noise(signals: LogSignals) -> LogSignals:
     return replace(signals, noise=noise, surface_noise_m=TYPICAL_SURFACE * float(np.abs(u).max()))
 
 
-def _compute_noise_shares(
-    residuals: LogResiduals, parameters: ParameterSet, before: Float1D, mapper: MapFunction
-) -> dict[tuple[str, str], Float1D]:
-    """Return how gains and resonances scale the noise of the row of each entry, (entry,).
+def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSignals:
+    """Return the signals without the noise of forces and accelerations, for slopes.
 
-    By kind and channel: the share of its noise in that of the row, for a resonance weighted with
-    the square of the angular frequency.
+    Readings of their own would be regressors with errors: where the bumpers always touch, a force
+    differs from K_j u + C_j u' by its noise alone, and its gain would be the one that explains this
+    noise. So forces and accelerations are those of the model and of the displacements.
     """
-    signals = residuals.signals
-    phase = np.exp(1j * np.cumsum(np.arange(signals.omega.size) * GOLDEN_ANGLE))  # as if random
-    rows = residuals.entry_row[: before.size]
-    counts = np.maximum(np.bincount(rows), 1)
-
-    def evaluate_noise(channel: str, gain: Float1D) -> Float1D:
-        density = gain * signals.noise[channel] * math.sqrt(signals.grid.size)
-        noisy = _with_spectra(signals, {channel: signals.spectra[channel] + density * phase})
-        return residuals.evaluate_rows(parameters, signals.fuse_corrected(noisy)) - before
-
-    def mean_products(channel: str) -> dict[str, Float1D]:
-        """Return the mean products of the noise of a channel with itself, scaled, (row,) each."""
-        noise = evaluate_noise(channel, np.ones_like(signals.omega))
-        scaled = {"gain": noise}
-        if channel in ACCELEROMETERS:
-            # never more than the noise itself, along which a force law need not be linear
-            largest = float(signals.omega[-1]) ** 2
-            scaled["resonance"] = largest * evaluate_noise(channel, signals.omega**2 / largest)
-        return {
-            kind: np.bincount(rows, weights=noise * values) / counts
-            for kind, values in scaled.items()
-        }
-
-    products = dict(zip(signals.channels, mapper(mean_products, signals.channels), strict=True))
-    total = np.maximum(np.sum([of["gain"] for of in products.values()], axis=0), 1e-300)
-    return {
-        (kind, channel): (product / total)[rows]
-        for channel, of_channel in products.items()
-        for kind, product in of_channel.items()
-    }
+    signals, m = residuals.signals, residuals.motion()
+    spectra, grid = dict(signals.spectra), signals.grid
+    model = parameters.model_for_log(residuals.log_number, m)
+    forces = forces_along(model, m.u, m.v, m.table_acc, m.time_s, residuals.contact_state)
+    damper, right, left = (grid.from_time_domain(np.nan_to_num(force)) for force in forces)
+    if "damper_force_n" in spectra:
+        spectra["damper_force_n"] = damper
+    for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, -left)):
+        measured = [spectra[cell] for cell in cells if cell in spectra]
+        if not measured:
+            continue
+        total = np.sum(measured, axis=0)
+        power = max(float(np.vdot(total, total).real), 1e-300)
+        for cell in cells:
+            if cell in spectra:
+                share = float(np.vdot(total, spectra[cell]).real) / power
+                spectra[cell] = share * force
+    square = -(signals.omega**2)
+    if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
+        spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
+    if {"table_acc_m_s2", "table_disp_m"} <= spectra.keys():
+        spectra["table_acc_m_s2"] = square * signals.fuse_body("table")
+    return replace(signals, spectra=spectra)
 
 
 def sensor_mask(residuals: LogResiduals) -> Bool2D:
