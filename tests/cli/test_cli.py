@@ -7,6 +7,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
@@ -153,14 +154,15 @@ def test_prc_says_the_numbers_of_the_summary(run_folder: Path) -> None:
 
 
 def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> None:
-    narrow = subprocess.run(
-        [SHAKETWIN, "prc", str(run_folder)],
-        capture_output=True,
-        text=True,
-        check=True,
-        env={**os.environ, "COLUMNS": "40"},
-    ).stdout
-    file = call_main("prc", run_folder).stdout
+    def read_curves(environment: Mapping[str, str]) -> str:
+        # in a process of its own: the width is that of the stream at its start
+        command = [SHAKETWIN, "prc", str(run_folder)]
+        return subprocess.run(
+            command, capture_output=True, text=True, check=True, env=dict(environment)
+        ).stdout
+
+    unset = {name: value for name, value in os.environ.items() if name != "COLUMNS"}
+    narrow, file = read_curves({**unset, "COLUMNS": "40"}), read_curves(unset)
     assert max(map(len, narrow.splitlines()[:9])) <= 40
     assert "3.400" in narrow
     assert "impacts L" in file

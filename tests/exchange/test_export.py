@@ -208,7 +208,7 @@ def test_what_a_call_wrote_goes_with_what_it_could_not_write(
     def slow(*_: Any) -> None:
         existing.write_text("mine")
 
-    monkeypatch.setattr("twin.exchange.foxglove.write_foxglove", slow)
+    monkeypatch.setattr("twin.exchange.export.write_foxglove", slow)
     with raises_input_error(where=existing):
         export_log(
             ExportOptions(log, ("csv", "foxglove"), tmp_path / "x", channels=("mass_disp_m",))
