@@ -13,6 +13,7 @@ from tests.discovery.played import (
     CELL_SHARE,
     SNM,
     TRUE,
+    distort,
     format_truth,
     imperfect_log,
     log,
@@ -68,6 +69,18 @@ def test_its_parameters_are_those_of_the_specimen() -> None:
     for key, true in ((STIFFNESS, TRUE.stiffness), (DAMPING, TRUE.damping)):
         assert fit.values[key] == pytest.approx(true, rel=0.01)
         assert abs(fit.values[key] - true) < 4.0 * fit.std_errors[key]
+
+
+def test_where_the_bumpers_always_touch_their_noise_is_no_gain_of_a_cell() -> None:
+    """A force then differs from its law by its noise alone, which its gain would explain."""
+    closed = log(gap_mm=0.0)
+    prepared = explain_with_nuisances(
+        prepare_problem([replace(closed, signals=distort(closed.signals))], SNM)
+    )
+    gains = [nuisance_values(prepared)[NuisanceKey(0, "gain", side)] for side in ("right", "left")]
+    # a gain of 0.5 % of both cells is 14 % of the stiffness of the damper
+    assert max(map(abs, gains)) < 1.0
+    assert prepared.first_fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.2)
 
 
 def test_no_effect_is_named_in_it() -> None:
