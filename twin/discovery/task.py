@@ -51,7 +51,7 @@ from twin.discovery.sensor_checks import check_sensors
 from twin.discovery.symbolic_regression import MISSING_MESSAGE, is_available
 from twin.laws.library import find_effect
 from twin.model.config import ModelConfig
-from twin.recording.reader import read_recording
+from twin.recording.reader import read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.results.recordings import build_provenance
 from twin.setup.run_config import read_model_template
@@ -214,8 +214,8 @@ def _format_discovered_model(
 
 def format_provenance(logs: Sequence[Path]) -> str:
     """Return the table [provenance] of a model that was identified from recordings, as TOML."""
-    recordings = [read_recording(resolve_log_path(log), ()) for log in logs]
-    return format_toml({"provenance": build_provenance(recordings).model_dump()})
+    starts = {path: read_start(path) for path in map(resolve_log_path, logs)}
+    return format_toml({"provenance": build_provenance(starts).model_dump()})
 
 
 @contextlib.contextmanager

@@ -71,7 +71,7 @@ def identify_table(
     else:
         identification = fit_table_twin(rehearsal, rig.moving_mass_kg, stall_n)
     title = f"{rig.title}, from {recording.run}"
-    provenance = build_provenance([recording])
+    provenance = build_provenance({recording.path: recording.start})
     return TableTwinResult(title, identification, discovery, rehearsal, provenance)
 
 

@@ -1,7 +1,7 @@
 """Opening of recordings by log or run folder, and their recorded configuration."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,28 +59,24 @@ def read_recorded_config(recording: Recording, model: str | None = None) -> RunC
     return replace(config, drive=replace(config.drive, steps=start.steps))
 
 
-def build_provenance(recordings: Sequence[Recording]) -> Provenance:
-    """Return the provenance of what is identified from recordings."""
-    starts = [recording.start for recording in recordings]
-    places = [str(recording.path) for recording in recordings]
+def build_provenance(starts: Mapping[Path, RunStart]) -> Provenance:
+    """Return the provenance of what is identified from recordings, by the path of each."""
     profiles = [
-        parse_toml(start.profile_toml, Profile, place)
-        for start, place in zip(starts, places, strict=True)
+        parse_toml(start.profile_toml, Profile, str(path)) for path, start in starts.items()
     ]
     rigs = [
-        HashedFile.of_rig(parse_toml(start.rig_toml, RigConfig, place))
-        for start, place in zip(starts, places, strict=True)
+        HashedFile.of_rig(parse_toml(start.rig_toml, RigConfig, str(path)))
+        for path, start in starts.items()
     ]
     specimens = [profile.specimen for profile in profiles]
-    levels = map(_find_level, starts, profiles)
+    levels = map(_find_level, starts.values(), profiles)
     return Provenance(
         rigs=tuple(dict.fromkeys(rigs)),
         masses_kg=tuple(sorted({specimen.mass_kg for specimen in specimens})),
         gaps_mm=tuple(sorted({1e3 * sum(specimen.gaps_m) for specimen in specimens})),
         levels_m_s2=tuple(sorted({level for level in levels if math.isfinite(level)})),
         sources=tuple(
-            HashedFile(name=recording.start.run, sha256=hash_file(recording.path))
-            for recording in recordings
+            HashedFile(name=start.run, sha256=hash_file(path)) for path, start in starts.items()
         ),
         code=read_installed_versions()["shaketwin"],
     )
