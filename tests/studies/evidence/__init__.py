@@ -1,0 +1,1 @@
+"""The study of evidence: recordings of laboratories that share no code with the product."""

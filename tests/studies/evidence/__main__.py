@@ -1,0 +1,286 @@
+"""Play the cases of the study of evidence: draw, import as a user would, discover, score.
+
+python -m tests.studies.evidence [--group NAME] [--seeds N] [--first N] [--out FILE]
+"""
+
+import argparse
+import json
+import tempfile
+import time
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from tests.studies.evidence.laboratory import (
+    Instruments,
+    Specimen,
+    StepTest,
+    record,
+    record_component,
+    vary,
+    write_table,
+)
+
+PROFILE = """title = "laboratory"
+rig = "simulated"
+model = "snm"
+[specimen]
+mass_kg = 550.0
+gap_mm = {gap}
+[sweep]
+start_hz = {start}
+stop_hz = {stop}
+step_hz = {step}
+cycles = {cycles}
+measured_cycles = 4
+acceleration_g = 0.05
+[acquisition]
+rate_hz = {rate}
+"""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One recording: where it comes from, and what would be right to say of it."""
+
+    group: str
+    name: str
+    seed: int
+    specimen: Specimen = Specimen()  # noqa: RUF009
+    lab: Instruments = Instruments()  # noqa: RUF009
+    test: StepTest = StepTest()  # noqa: RUF009
+    component: tuple[tuple[float, ...], tuple[float, ...], float] | None = None
+    truth: tuple[str, ...] = ()
+    place: str = ""  # of a stranger: "damper" or "bumper"
+    options: dict[str, float] = field(default_factory=dict)
+
+
+def draw_component_cases(seeds: range) -> Iterator[Case]:
+    """Clean component tests: noise x rate x frequencies."""
+    for seed in seeds:
+        rng = np.random.default_rng(1000 + seed)
+        noise = 1e-6 * float(rng.choice([1.0, 3.0, 10.0, 30.0]))
+        rate = float(rng.choice([100.0, 200.0, 500.0, 1000.0, 2000.0]))
+        hz = ((1.0,), (0.5, 2.0), (0.5, 1.0, 3.0))[int(rng.integers(3))]
+        amplitude = ((2e-3,), (1e-3, 4e-3))[int(rng.integers(2))]
+        lab = Instruments(laser=noise, cell=0.5, gain=0.002, lag_s=0.0, offset=0.0)
+        yield Case(
+            "component", f"noise {noise:.0e} rate {rate:.0f} hz {hz} a {len(amplitude)}", seed,
+            vary(Specimen(gap_mm=np.inf), rng), lab, component=(hz, amplitude, rate),
+        )  # fmt: skip
+
+
+LABS = {
+    "plain": Instruments(),
+    "filter": Instruments(filter_share=0.2),
+    "no rest": Instruments(rest_s=0.0),
+    "filter no rest": Instruments(filter_share=0.2, rest_s=0.0),
+    "hum": Instruments(hum=3.0),
+    "beat": Instruments(hum=3.0, beat_hz=0.3),
+    "pink": Instruments(pink=2.0),
+    "plate": Instruments(plate_kg=2.0),
+    "no mass acc": Instruments(missing=("mass_acc_m_s2",)),
+    "no lasers' mate": Instruments(missing=("table_acc_m_s2",)),
+    "all": Instruments(filter_share=0.25, hum=2.0, beat_hz=0.3, pink=1.0, plate_kg=1.0),
+}
+GAPS = {"g0": 0.0, "gm1": -1.0, "g4": 4.0, "g10": 10.0, "free": 40.0}
+
+
+def draw_clean_cases(seeds: range) -> Iterator[Case]:
+    """Clean recordings of laboratories: gap x instruments."""
+    names = [(gap, lab) for gap in GAPS for lab in LABS]
+    for seed in seeds:
+        gap, lab = names[(7 * seed) % len(names)]
+        rng = np.random.default_rng(2000 + seed)
+        yield Case(
+            "clean", f"{gap} {lab}", seed, vary(Specimen(gap_mm=GAPS[gap]), rng), LABS[lab],
+            _test(gap),
+        )  # fmt: skip
+
+
+EFFECTS: dict[str, tuple[str, dict[str, float]]] = {
+    "cubic_stiffness": ("g10", {"k3": 3e8}),
+    "coulomb_friction": ("g4", {"fc": 8.0}),
+    "quadratic_damping": ("g10", {"c2": 2500.0}),
+    "bouc_wen": ("g10", {"bw_force": 25.0, "bw_yield": 1e-3}),
+    "maxwell_damper": ("g10", {"k1": 4e3, "tau": 0.05}),
+    "bumper_hardening": ("g4", {"k2": 1.2e8}),
+    "hunt_crossley": ("g4", {"hc": 2.5e6}),
+    "bumper_maxwell": ("g4", {"kb": 6e4, "tau_b": 0.02}),
+    "bumper_asymmetry": ("g4", {"kr": 580e3}),
+    "gap_drift": ("g4", {"wear": 5e-6}),
+    "table_tilt": ("g10", {"tilt": 0.05}),
+}
+
+
+def draw_effect_cases(seeds: range) -> Iterator[Case]:
+    """One effect of the library, well above the noise, in several laboratories."""
+    labs = ("plain", "filter", "no rest", "pink", "plate")
+    for seed in seeds:
+        effect = [*EFFECTS][seed % len(EFFECTS)]
+        gap, hidden = EFFECTS[effect]
+        lab = labs[seed // len(EFFECTS) % len(labs)]
+        rng = np.random.default_rng(3000 + seed)
+        specimen = replace(vary(Specimen(gap_mm=GAPS[gap]), rng), hidden=hidden)
+        yield Case(
+            "effect", f"{effect} {gap} {lab}", seed, specimen, LABS[lab], _test(gap),
+            truth=(effect,),
+        )  # fmt: skip
+
+
+STRANGERS: dict[str, tuple[str, str, dict[str, float]]] = {
+    "soft layer": ("g4", "bumper", {"soft_depth": 4e-4, "soft_share": 0.3}),
+    "flexible mount": ("g4", "bumper", {"mount_k": 1.5e6}),
+    "hertz": ("g4", "bumper", {"stop_power": 1.5}),
+    "friction with u": ("g10", "damper", {"friction_u": 4000.0}),
+    "saturating spring": ("g10", "damper", {"tanh_force": 30.0, "tanh_u": 1e-3}),
+    "fifth power": ("g10", "damper", {"k5": 3e13}),
+    "dead band": ("g10", "damper", {"dead_band": 3e-4}),
+    "warming": ("g10", "damper", {"warming": 0.055}),
+    "u |u|": ("g10", "damper", {"softening": 1e6}),
+    "stribeck": ("g10", "damper", {"fc": 8.0, "stribeck": 1.0}),
+    "adhesion": ("g4", "bumper", {"pull": 60.0}),
+    "damping cools": ("g10", "damper", {"cooling": 0.3}),
+}
+
+
+def draw_stranger_cases(seeds: range) -> Iterator[Case]:
+    """Effects that the library lacks, or names otherwise."""
+    for seed in seeds:
+        name = [*STRANGERS][seed % len(STRANGERS)]
+        gap, place, hidden = STRANGERS[name]
+        rng = np.random.default_rng(4000 + seed)
+        specimen = replace(vary(Specimen(gap_mm=GAPS[gap]), rng), hidden=hidden)
+        yield Case("stranger", f"{name} {gap}", seed, specimen, LABS["plain"], _test(gap),
+                   place=place)  # fmt: skip
+
+
+def _test(gap: str) -> StepTest:
+    if gap in ("g0", "gm1"):
+        return StepTest(2.0, 9.0, 1.0, cycles=10)
+    return StepTest()
+
+
+GROUPS = {
+    "component": draw_component_cases,
+    "clean": draw_clean_cases,
+    "effect": draw_effect_cases,
+    "stranger": draw_stranger_cases,
+}
+
+
+def play(case: Case) -> dict[str, object]:
+    """Return what the product says of a case, next to the truth."""
+    from twin.discovery.task import discover
+    from twin.exchange.import_table import ImportOptions, import_table
+
+    s = case.specimen
+    with tempfile.TemporaryDirectory() as text:
+        folder = Path(text)
+        if case.component is not None:
+            columns = record_component(s, case.lab, case.seed, *case.component)
+            options = ImportOptions(accept=True)
+        else:
+            columns = record(s, case.lab, case.seed, case.test)
+            t = case.test
+            (folder / "lab.toml").write_text(
+                PROFILE.format(
+                    gap=s.gap_mm, start=t.start_hz, stop=t.stop_hz, step=t.step_hz,
+                    cycles=t.cycles, rate=t.rate_hz,
+                )
+            )  # fmt: skip
+            options = ImportOptions(profile=folder / "lab.toml", accept=True)
+        table = write_table(columns, folder / "log.csv")
+        start = time.process_time()
+        row: dict[str, object] = {
+            "group": case.group, "name": case.name, "seed": case.seed, "truth": case.truth,
+            "place": case.place,
+        }  # fmt: skip
+        try:
+            import_table(table, folder / "log.mcap", options)
+            start = time.process_time()
+            result = discover([folder / "log.mcap"])
+        except Exception as error:
+            return {**row, "verdict": f"error {type(error).__name__}: {str(error)[:150]}"}
+        verdict = result.verdict
+        base = verdict.base
+        row |= {
+            "verdict": verdict.verdict,
+            "effects": [
+                e.id + (f".{e.channel}" if getattr(e, "channel", None) else "")
+                for e in verdict.effects
+            ],
+            "law": [term.id for term in verdict.law.terms] if verdict.law else [],
+            "sensors": verdict.sensors.state,
+            "blamed": [
+                f"{c.kind} {'+'.join(c.channels)}" for c in verdict.sensors.checks if not c.healthy
+            ],
+            "confidence": round(verdict.effects[0].confidence, 3) if verdict.effects else None,
+            "before": round(verdict.gap.held_out_before, 3),
+            "after": round(verdict.gap.held_out_after, 3),
+            "floor": round(verdict.gap.noise_floor, 3),
+            "seconds": round(time.process_time() - start, 1),
+            "why": verdict.why[:160],
+            "probability": [
+                ("+".join(e.effects), e.stranger, round(e.probability, 3))
+                for e in verdict.probability[:4]
+            ],
+        }
+        for name, true in (("stiffness", s.k), ("damping", s.c), ("bumper_stiffness", s.kb),
+                           ("bumper_damping", s.cb)):  # fmt: skip
+            entry = base.get(name)
+            if entry is not None:
+                half = (entry.high or np.inf) - entry.value
+                row[name] = [round(entry.value / true, 4), round(half / true, 4),
+                             bool(abs(entry.value - true) <= half)]  # fmt: skip
+        return row
+
+
+def judge(row: dict[str, object]) -> str:
+    """Return right, wrong or half for what is said of a case."""
+    verdict, effects = str(row["verdict"]), [str(e) for e in row.get("effects", [])]  # type: ignore[attr-defined]
+    blamed = any(e.startswith(("sensor_", "mass_error")) for e in effects)
+    if row["group"] in ("component", "clean"):
+        return "right" if verdict == "none" and not row.get("blamed") else "wrong"
+    if row["group"] == "effect":
+        if verdict == "named" and effects == [*row["truth"]]:  # type: ignore[misc]
+            return "right"
+        return "open" if verdict in ("unexplained", "ambiguous") and not blamed else "wrong"
+    law = row.get("law")
+    if verdict == "unexplained" and not blamed:
+        return "right"
+    return "law" if law and not blamed else "wrong"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--group", default="")
+    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--match", default="")
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.seeds)
+    groups = [options.group] if options.group else [*GROUPS]
+    cases = [c for g in groups for c in GROUPS[g](seeds) if options.match in c.name]
+    rows = []
+    with ProcessPoolExecutor(options.workers) as pool:
+        for done in as_completed([pool.submit(play, each) for each in cases]):
+            row = done.result()
+            row["score"] = judge(row)
+            rows.append(row)
+            parts = {k: v for k, v in row.items() if k not in ("group", "truth", "place")}
+            print(row["group"], json.dumps(parts), flush=True)
+            if options.out:
+                options.out.write_text("\n".join(map(json.dumps, rows)))
+    for group in groups:
+        scores = [r["score"] for r in rows if r["group"] == group]
+        print(group, {s: scores.count(s) for s in sorted({*scores})}, "of", len(scores))
+
+
+if __name__ == "__main__":
+    main()
