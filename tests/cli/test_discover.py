@@ -221,12 +221,10 @@ def test_motion_alone_says_nothing_of_forces(plain: Made, tmp_path: Path) -> Non
     assert "mass_acc_m_s2" in error.value.allowed
 
 
-def test_a_load_cell_that_bears_nothing_is_no_candidate(tmp_path: Path) -> None:
+def test_a_fault_of_a_sensor_is_no_candidate_for_a_force(tmp_path: Path) -> None:
     (log,), _ = load_logs([record_run(tmp_path / "flight", gap="inf").log])
-    names = {
-        library.name
-        for library in prepare_problem([log], read_model_template("snm")[0]).problem.library
-    }
-    assert "sensor_gain.mass_acc_m_s2" in names
-    assert "sensor_offset.force_r1_n" in names
-    assert not {"sensor_gain.force_r1_n", "sensor_lag.force_l2_n"} & names
+    library = prepare_problem([log], read_model_template("snm")[0]).problem.library
+    names = {candidate.name for candidate in library}
+    assert "cubic_stiffness" in names
+    assert not {"bumper_hardening", "mass_error"} & names
+    assert not any(name.startswith("sensor_") for name in names)

@@ -15,7 +15,9 @@ from table_io.records import RunStart
 from table_io.sim.config import SimulatedTableConfig
 from tests.builders.rigs import RIG
 from tests.builders.truths import seal_truth
-from twin.discovery.discover import PreparedLog
+from twin.discovery.discover import PreparedLog, PreparedProblem
+from twin.discovery.parameters import NuisanceKey
+from twin.discovery.residuals import build_log_residuals
 from twin.discovery.signals import LogSignals, build_signals
 from twin.model.model import Model
 from twin.model.parameters import Parameters
@@ -90,6 +92,22 @@ def imperfect_log(truth: str = "") -> PreparedLog:
     """The same, of such a laboratory."""
     prepared = log(truth)
     return replace(prepared, signals=distort(prepared.signals))
+
+
+def idealize(prepared: PreparedProblem) -> PreparedProblem:
+    """The problem with instruments that have the noise of their rest alone."""
+    fit = prepared.first_fit
+    residuals = build_log_residuals(
+        [
+            (each.signals if each.nuisances is None else each.nuisances.raw, each.contact_n)
+            for each in prepared.problem.log_residuals
+        ],
+        prepared.problem.log_residuals[0].reference,
+    )
+    free = tuple(own for own in fit.free if not isinstance(own.key, NuisanceKey))
+    fit = replace(fit, parameters=fit.parameters.with_free(free))
+    problem = replace(prepared.problem, log_residuals=residuals)
+    return replace(prepared, problem=problem, first_fit=fit)
 
 
 def format_truth(effect: str, channel: str = "", form: str = "", **parameters: float) -> str:

@@ -20,9 +20,7 @@ from tests.discovery.played import (
 )
 from twin.discovery.discover import (
     PreparedProblem,
-    add_nuisances,
     discover_effects,
-    explain_with_nuisances,
     prepare_problem,
 )
 from twin.discovery.nuisances import (
@@ -31,17 +29,17 @@ from twin.discovery.nuisances import (
     TYPICAL_SHARE,
     correct_signals,
     linearize_nuisances,
+    list_nuisance_parameters,
     list_nuisances,
     sensor_mask,
 )
 from twin.discovery.parameters import DAMPING, STIFFNESS, NuisanceKey
 from twin.discovery.residuals import Nuisance
-from twin.discovery.selection import MAX_EXPLAINED_COST
 
 
 @cache
 def explain_imperfect_log() -> PreparedProblem:
-    return explain_with_nuisances(prepare_problem([imperfect_log()], SNM))
+    return prepare_problem([imperfect_log()], SNM)
 
 
 def nuisance_values(prepared: PreparedProblem) -> Mapping[NuisanceKey, float]:
@@ -53,9 +51,8 @@ def nuisance_values(prepared: PreparedProblem) -> Mapping[NuisanceKey, float]:
 
 
 def test_a_usual_laboratory_is_explained_by_its_instruments() -> None:
-    assert prepare_problem([imperfect_log()], SNM).first_fit.cost > 2.0
     prepared = explain_imperfect_log()
-    assert prepared.first_fit.cost < MAX_EXPLAINED_COST
+    assert prepared.first_fit.cost < 1.1 * prepared.problem.expected_square
     values = nuisance_values(prepared)
     share = (CELL_SHARE - 0.5) / TYPICAL_SHARE
     assert values[NuisanceKey(0, "share", "right")] == pytest.approx(share, rel=0.1)
@@ -74,9 +71,7 @@ def test_its_parameters_are_those_of_the_specimen() -> None:
 def test_where_the_bumpers_always_touch_their_noise_is_no_gain_of_a_cell() -> None:
     """A force then differs from its law by its noise alone, which its gain would explain."""
     closed = log(gap_mm=0.0)
-    prepared = explain_with_nuisances(
-        prepare_problem([replace(closed, signals=distort(closed.signals))], SNM)
-    )
+    prepared = prepare_problem([replace(closed, signals=distort(closed.signals))], SNM)
     gains = [nuisance_values(prepared)[NuisanceKey(0, "gain", side)] for side in ("right", "left")]
     # a gain of 0.5 % of both cells is 14 % of the stiffness of the damper
     assert max(map(abs, gains)) < 1.0
@@ -99,23 +94,13 @@ def test_an_effect_is_named_in_it_with_its_parameter() -> None:
     assert verdict.best.fit.values[k2.key] == pytest.approx(3e7, rel=0.05)
 
 
-def test_a_fault_of_one_cell_is_named() -> None:
-    """A gain of 5 % is no error that every laboratory has."""
+def test_unequal_cells_blame_no_cell_and_move_no_parameter() -> None:
+    """The force balance cannot tell the gain of one cell from the way in which two share."""
     truth = format_truth("sensor_gain", "force_r1_n", gain=1.05)
     verdict = discover_effects([log(truth)], SNM).verdict
-    assert verdict.outcome == "named"
-    assert verdict.best.names == ("sensor_gain.force_r1_n",)
-    assert verdict.best.fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.005)
-
-
-def test_ideal_instruments_need_no_nuisances() -> None:
-    prepared = prepare_problem([log()], SNM)
-    assert explain_with_nuisances(prepared) is prepared
-
-
-def test_what_nuisances_cannot_explain_is_left_to_ideal_instruments() -> None:
-    prepared = prepare_problem([log(format_truth("bumper_hardening", k2=3e7))], SNM)
-    assert explain_with_nuisances(prepared) is prepared
+    assert verdict.outcome == "none"
+    stiffness = verdict.best.fit.values[STIFFNESS]
+    assert abs(stiffness - TRUE.stiffness) < 2.5 * verdict.best.fit.std_errors[STIFFNESS]
 
 
 @pytest.mark.parametrize(
@@ -144,13 +129,14 @@ def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str])
 
 
 def test_a_prior_holds_every_nuisance() -> None:
-    """Its entries are the values, and its bounds those of a typical error."""
-    prepared = add_nuisances(prepare_problem([log()], SNM), 1.0)
+    """Its entries are the values: an error four times the typical one costs eight of evidence."""
+    prepared = prepare_problem([log()], SNM)
     residuals = prepared.problem.log_residuals[0]
     values = nuisance_values(prepared)
     entries = residuals.evaluate(prepared.parameters)[-len(values) :]
     assert entries == pytest.approx([*values.values()])
     assert all(abs(value) <= MAX_SIZE for value in values.values())
+    assert all(math.isinf(free.high) for free in list_nuisance_parameters([residuals]))
     assert not sensor_mask(residuals)[0]  # the damper row
     assert sensor_mask(residuals)[-1]
 

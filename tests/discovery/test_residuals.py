@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
+from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet, TermKey
 from twin.discovery.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
 
@@ -25,8 +26,9 @@ def test_forces_at_the_used_samples_are_those_of_the_whole_motion(
     values: Mapping[ParameterKey, float],
 ) -> None:
     prepared = log()
-    (residuals,) = build_log_residuals([(prepared.signals, prepared.contact_n)], SNM)
+    (of_facts,) = build_log_residuals([(prepared.signals, prepared.contact_n)], SNM)
     parameters = ParameterSet.from_model(SNM, 1).with_values(values)
+    residuals = resolve_samples(of_facts, parameters)
     m = residuals.motion()
     whole = residuals.force_errors(parameters, m)
     noise = residuals.force_noise(m, m.mass_kg)

@@ -1,5 +1,6 @@
 """A planted truth, demanded back from recordings within the stated intervals."""
 
+import math
 import re
 from functools import cache
 
@@ -10,7 +11,7 @@ from table_io.errors import InputError
 from tests.recovery.recordings import FAR, TRUTH, make_noisy_blocks, prepare_log
 from twin.discovery.cross_checks import fitted_gap
 from twin.discovery.discover import prepare_problem
-from twin.discovery.identify import IdentificationResult, correct_bias, identify_parameters
+from twin.discovery.identify import IdentificationResult, identify_parameters
 from twin.discovery.least_squares import FitResult, fit_parameters
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
@@ -47,8 +48,10 @@ def test_a_truth_far_from_the_start_is_found_within_its_intervals() -> None:
     assert joint.at_bound == ()
     for key, value in {**TRUE_BASE, GapKey(0): 4e-4}.items():
         assert within(joint, key, value), key
-        assert 0 < joint.std_errors[key] < 0.01 * value, key
-    assert np.sqrt(joint.cost) == pytest.approx(1.0, abs=0.03)
+        size = 2.4e-3 if isinstance(key, GapKey) else value
+        assert 0 < joint.std_errors[key] < 0.03 * size, key
+    expected = identify_wide_gaps().problem.expected_square
+    assert joint.cost == pytest.approx(expected, rel=0.15)
 
 
 def test_flight_contacts_and_onsets_agree() -> None:
@@ -58,7 +61,8 @@ def test_flight_contacts_and_onsets_agree() -> None:
     estimates = [(key, pair) for part in parts.values() for key, pair in part.items()]
     for key, (value, sd) in estimates:
         truth = {**TRUE_BASE, GapKey(0): 4e-4}[key]
-        assert abs(value - truth) < max(4 * sd, 0.003 * truth), key
+        size = 2.4e-3 if isinstance(key, GapKey) else truth  # the correction of a gap of that size
+        assert abs(value - truth) < max(4 * sd, 0.003 * size), key
     kinds = {(gap.side, gap.kind) for gap in identify_wide_gaps().contact_gaps}
     assert kinds == {(s, k) for s in ("right", "left") for k in ("onset", "release")}
     for gap in identify_wide_gaps().contact_gaps:
@@ -123,7 +127,7 @@ def test_unequal_gaps_are_warned_of_with_the_right_sign() -> None:
 
 
 def test_a_changed_bumper_side_is_seen_between_the_parts() -> None:
-    """The right cells read 10 % too much: right and left contacts do not say the same."""
+    """The right cells read 10 % too much: a bumper, or an error that no laboratory has."""
     (block,) = make_noisy_blocks(0.01, 7)
     values = block.values.copy()
     values[4:6] *= 1.1
@@ -131,9 +135,7 @@ def test_a_changed_bumper_side_is_seen_between_the_parts() -> None:
         "meas", 0, block.rate_hz, block.channels, values, block.step, block.label, block.cycle
     ),)  # fmt: skip
     result = identify_parameters([prepare_log(changed)], [changed], FAR)
-    assert any(
-        text.startswith("bumper_stiffness") and "contact right" in text for text in result.warnings
-    )
+    assert any("gain of right" in text for text in result.warnings)
 
 
 def test_an_effect_of_the_start_is_fitted_too() -> None:
@@ -171,12 +173,11 @@ def test_too_short_a_log_is_refused() -> None:
     assert error.value.allowed.startswith("at least 1000")
 
 
-def joint(noise: float, seed: int) -> tuple[FitResult, FitResult]:
-    """(the fit as it is, cured)."""
+def joint(noise: float, seed: int) -> FitResult:
+    """Return the fit of the base to a noisy recording."""
     blocks = make_noisy_blocks(noise, seed)
     prepared = prepare_problem([prepare_log(blocks)], Model.from_flat({**FAR.flatten()}))
-    raw = fit_parameters(prepared.problem.log_residuals, prepared.parameters)
-    return raw, correct_bias(prepared.problem.log_residuals, raw)
+    return fit_parameters(prepared.problem.log_residuals, prepared.parameters)
 
 
 def test_intervals_cover_the_truth_at_their_level() -> None:
@@ -185,7 +186,7 @@ def test_intervals_cover_the_truth_at_their_level() -> None:
         abs(fit.values[key] - value) < SIGMA_OF_95_PERCENT * fit.std_errors[key]
         for noise in (0.01, 0.05)
         for seed in range(6)
-        for fit in (joint(noise, 100 + seed)[1],)
+        for fit in (joint(noise, 100 + seed),)
         for key, value in {**TRUE_BASE, GapKey(0): 0.0}.items()
     ]
     assert len(hits) == 60
@@ -193,12 +194,11 @@ def test_intervals_cover_the_truth_at_their_level() -> None:
 
 
 def test_noise_of_the_motion_is_no_softening() -> None:
-    """At 10 % noise least squares makes the bumpers too soft by far; the cure takes it back."""
-    pairs = [joint(0.1, 200 + seed) for seed in range(4)]
-    truth = TRUTH["bumper_stiffness"]
-    raw, mended = (np.mean([pair[k].values[BUMPER_STIFFNESS] for pair in pairs]) for k in (0, 1))
-    assert raw < truth
-    assert abs(mended - truth) < 0.5 * abs(raw - truth)
+    """Errors of a regressor attenuate its slope: at 10 % samples made the bumpers too soft."""
+    fits = [joint(0.1, 200 + seed) for seed in range(4)]
+    errors = [fit.values[BUMPER_STIFFNESS] - TRUTH["bumper_stiffness"] for fit in fits]
+    deviation = np.mean([fit.std_errors[BUMPER_STIFFNESS] for fit in fits])
+    assert abs(np.mean(errors)) < 2.0 * deviation / math.sqrt(len(fits))
 
 
 def test_parameters_without_data_keep_their_start() -> None:

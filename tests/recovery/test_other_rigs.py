@@ -88,7 +88,7 @@ def test_intervals_from_few_contacts_are_honest() -> None:
         hits.append(
             abs(fit.values[BUMPER_STIFFNESS] - K_J) < 1.96 * fit.std_errors[BUMPER_STIFFNESS]
         )
-        assert 1e-3 < fit.std_errors[BUMPER_STIFFNESS] / K_J < 0.1
+        assert 1e-3 < fit.std_errors[BUMPER_STIFFNESS] / K_J < 0.2
         assert fit.block_counts[BUMPER_STIFFNESS] < 4.0
         assert any(text.startswith("bumper_stiffness: determined by") for text in result.warnings)
     assert sum(hits) >= 7

@@ -11,6 +11,7 @@ from twin.discovery.discover import Discovery, PreparedLog, discover_effects
 from twin.discovery.figure_data import DiscoveryView
 from twin.discovery.force_figures import draw_residual_forces
 from twin.discovery.parameters import EffectKey
+from twin.discovery.selection import fit_generic_terms
 
 CUBIC = Hidden("cubic_stiffness", 3e6)
 
@@ -46,7 +47,8 @@ def test_the_law_is_that_of_the_effect_over_its_displacement() -> None:
 
 def test_a_generic_term_is_drawn_apart_from_what_was_named() -> None:
     discovery, log = without_accelerometer()
-    generic = discovery.selection.generic_sets[0]
+    problem, best = discovery.prepared.problem, discovery.verdict.best
+    generic = fit_generic_terms(problem, best)[0]
     named = replace(discovery, verdict=replace(discovery.verdict, generic=generic))
     view = DiscoveryView(named, [log])
     assert view.law is named.verdict.best

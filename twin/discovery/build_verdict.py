@@ -8,6 +8,7 @@ from twin.discovery.discover import Discovery, PreparedLog
 from twin.discovery.held_out import compute_force_error
 from twin.discovery.law_search import LawProposal
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
+from twin.discovery.nuisances import list_sizes
 from twin.discovery.parameters import (
     SLIP_SPEED,
     EffectKey,
@@ -23,6 +24,9 @@ from twin.discovery.result import (
     CandidateResult,
     EffectResult,
     ExcludedSet,
+    ExcludedSize,
+    ExplanationResult,
+    FittedNuisance,
     Gap,
     GenericTerm,
     HeldOutLog,
@@ -39,7 +43,12 @@ from twin.discovery.result import (
 )
 from twin.discovery.selection import FittedSet
 from twin.discovery.sensor_checks import SensorCheck, check_sensors
-from twin.discovery.verdict import closed_fraction, suggest_next_run
+from twin.discovery.verdict import (
+    EXCLUDED_PROBABILITY,
+    closed_fraction,
+    suggest_next_run,
+    sum_by_set,
+)
 from twin.model.model import Model
 
 METRIC = (
@@ -75,7 +84,9 @@ def build_verdict(
         effects=[_build_effect(effect, best.fit, verdict.confidence) for effect in best.effects],
         ambiguous=[[*names], *([*ids] for ids in alternatives)] if alternatives else [],
         candidates=_list_candidates(
-            selection.null, (*selection.tried, *selection.generic_sets), factor
+            selection.null,
+            (*selection.tried, *([verdict.generic] if verdict.generic else [])),
+            factor,
         ),
         where=Location(
             frequency_hz=list(where.frequency_hz) if where.frequency_hz else None,
@@ -95,6 +106,14 @@ def build_verdict(
             closed_fraction=closed_fraction(null.cost, best.cost, verdict.floor),
         ),
         staircase=_build_staircase(discovery, factor, proposal),
+        probability=[
+            ExplanationResult(
+                effects=[*each.names], stranger=each.place, probability=each.probability
+            )
+            for each in selection.explanations
+        ],
+        excludes=_list_excluded_sizes(discovery),
+        nuisances=_list_nuisances(discovery),
         excluded=_list_excluded(discovery, factor),
         remainder=Remainder(
             unexplained=verdict.has_remainder,
@@ -159,6 +178,7 @@ def _build_staircase(
 def _list_excluded(discovery: Discovery, factor: float) -> list[ExcludedSet]:
     """Return the sets of as many other effects as the best, best first, and how much worse."""
     best, problem = discovery.verdict.best, discovery.prepared.problem
+    probabilities = sum_by_set(discovery.selection.explanations)
     rivals: dict[frozenset[str], FittedSet] = {}
     for fitted in sorted(discovery.selection.tried, key=lambda fitted: fitted.cost):
         names = frozenset(fitted.names)
@@ -170,8 +190,47 @@ def _list_excluded(discovery: Discovery, factor: float) -> list[ExcludedSet]:
             held_out_error=factor * math.sqrt(rival.cost),
             sigma=problem.compute_gain(rival, best)[2],
         )
-        for rival in rivals.values()
+        for names, rival in rivals.items()
+        if probabilities.get(names, 0.0) < EXCLUDED_PROBABILITY
     ]
+
+
+def _list_excluded_sizes(discovery: Discovery) -> list[ExcludedSize]:
+    """Return the largest size of each effect that is not in the best set."""
+    linear, best = discovery.selection.evidence, discovery.verdict.best
+    if linear is None:
+        return []
+    kept = [linear.find_column(effect, best.find_shape(effect)) for effect in best.effects]
+    largest: dict[str, ExcludedSize] = {}
+    for column, variant in enumerate(linear.variants):
+        candidate = variant.candidate
+        if candidate.name in best.names or not linear.scale[column] > 0:
+            continue
+        value, share = linear.bound_amplitude(column, [k for k in kept if k is not None])
+        size = ExcludedSize(
+            id=candidate.name, parameter=str(candidate.amplitude.key).rsplit(".", 1)[-1],
+            value=value, unit=candidate.amplitude.unit, force_share=share,
+        )  # fmt: skip
+        known = largest.get(candidate.name)
+        if known is None or share > known.force_share:
+            largest[candidate.name] = size
+    return sorted(largest.values(), key=lambda size: size.force_share)
+
+
+def _list_nuisances(discovery: Discovery) -> list[FittedNuisance]:
+    """Return the fitted nuisances that exceed their typical size, the largest first."""
+    values = discovery.verdict.best.fit.parameters
+    fitted = []
+    for residuals in discovery.prepared.problem.log_residuals:
+        fitted += [
+            FittedNuisance(
+                log=residuals.signals.name, kind=nuisance.kind, place=nuisance.place,
+                value=z * nuisance.size, unit=nuisance.unit, typical=abs(z),
+            )
+            for nuisance, z in list_sizes(residuals, values)
+            if abs(z) > 1.0
+        ]  # fmt: skip
+    return sorted(fitted, key=lambda nuisance: -nuisance.typical)
 
 
 def _judge_held_out(log: PreparedLog, discovery: Discovery, given: Model | None) -> HeldOutLog:

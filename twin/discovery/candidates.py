@@ -38,6 +38,9 @@ RESONANCE_RATIO = 1.12  # between trial frequencies: about the width of a resona
 MAX_RESONANCE_SHARE = 0.1  # of the sampling rate: highest trial frequency
 
 
+INSTRUMENT_REASON = "an error of an instrument: sensors judge sensors, no force law does"
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """Candidate effect with a ladder of trial shapes.
@@ -129,19 +132,20 @@ def list_candidates(
     candidates, excluded = [], {}
     for effect in (*EFFECTS, *load_plugins()):
         reason = _exclusion_reason(effect, has_contact, channels)
+        untared = channels - set().union(*(r.signals.rest_values for r in log_residuals))
+        is_offset = effect.id == "sensor_offset" and "damper_force_n" in untared
+        if (effect.acts == "sensor" and not is_offset) or effect.id == "mass_error":
+            reason = INSTRUMENT_REASON
         if effect.id in without:
             reason = "left out of the library"
         if reason:
             excluded[effect.id] = reason
             continue
-        for channel in sorted(_checkable_channels(channels)) if effect.acts == "sensor" else ("",):
+        # a force sensor that was not tared may read anything, and is held against no other one
+        for channel in ("damper_force_n",) if effect.acts == "sensor" else ("",):
             candidate = Candidate.from_effect(effect, channel, log_residuals[0].scale)
             already_free = {free.key for free in candidate.free} & fitted.values.keys()
-            if (
-                not already_free
-                and not _is_unobservable(candidate, channels)
-                and not _is_unloaded(candidate, log_residuals)
-            ):
+            if not already_free:
                 candidates.append(candidate)
     return tuple(candidates), excluded
 
@@ -157,33 +161,6 @@ def _exclusion_reason(effect: Effect, has_contact: bool, channels: set[str]) -> 
         if "damper_force_n" in channels or not (cells and has_contact):
             return "needs measured bumper forces in addition to the acceleration of the mass"
     return ""
-
-
-def _checkable_channels(channels: set[str]) -> set[str]:
-    """Return the channels whose sensor can be checked: all except the displacement reference."""
-    has_both = {"mass_disp_m", "table_disp_m"} <= channels
-    return channels - ({"rel_disp_m"} if has_both else {"mass_disp_m", "table_disp_m"})
-
-
-def _is_unobservable(candidate: Candidate, channels: set[str]) -> bool:
-    """Return True for a sensor gain that no other measurement can contradict."""
-    gain = candidate.name.startswith("sensor_gain.")
-    if "damper_force_n" in channels and candidate.channel == "damper_force_n":
-        return gain
-    no_mass_acc = "mass_acc_m_s2" not in channels
-    return no_mass_acc and gain and candidate.channel in ("table_acc_m_s2", "rel_disp_m")
-
-
-def _is_unloaded(candidate: Candidate, log_residuals: Sequence[LogResiduals]) -> bool:
-    """Return True for gain or lag of a load cell without contact: it would only scale noise."""
-    sensor_sides = [
-        side for side, cells in enumerate((RIGHT_CELLS, LEFT_CELLS)) if candidate.channel in cells
-    ]
-    is_offset = candidate.name.startswith("sensor_offset.")
-    return not is_offset and any(
-        not any((residuals.contact_state[side] > 0).any() for residuals in log_residuals)
-        for side in sensor_sides
-    )
 
 
 def _list_shapes(

@@ -11,6 +11,7 @@ from table_io.records import Step
 from twin.discovery.contact_onsets import ContactGaps
 from twin.discovery.least_squares import FitResult, compute_slopes, fit_parameters
 from twin.discovery.motion import RecordScale
+from twin.discovery.nuisances import MAX_SIZE, fix_nuisances, list_sizes
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
     BUMPER_STIFFNESS,
@@ -74,14 +75,13 @@ def estimate_subsets(
 ) -> tuple[SubsetEstimate, ...]:
     """Estimate the parameters from free flight, contacts of each side, and opposed halves."""
     # errors of instruments are determined by all samples together
+    log_residuals = [fix_nuisances(residuals, joint.parameters) for residuals in log_residuals]
     free = [parameter for parameter in joint.free if not is_correction(parameter.key)]
     of_contact = [parameter for parameter in free if is_of_contact(parameter.key, joint.parameters)]
     flight = [parameter for parameter in free if parameter not in of_contact]
-    estimates = [
-        _estimate_subset(
-            "free flight", log_residuals, joint, flight, [*map(_flight_mask, log_residuals)]
-        )
-    ]
+    in_flight = [_select_flight(residuals) for residuals in log_residuals]
+    masks = [residuals.entry_row == 0 for residuals in in_flight]
+    estimates = [_estimate_subset("free flight", in_flight, joint, flight, masks)]
     for row, side in ((1, "right"), (2, "left")):
         side_free = [
             replace(parameter, tied=(BaseKey(f"{parameter.name}_{side[0]}"),))
@@ -112,8 +112,11 @@ def is_of_contact(key: ParameterKey, parameters: ParameterSet) -> bool:
     return isinstance(key, GapKey) or key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
 
 
-def _flight_mask(residuals: LogResiduals) -> Bool2D:
-    """Return the damper entries in flight, (entry,); well inside the gaps if contact is unknown."""
+def _select_flight(residuals: LogResiduals) -> LogResiduals:
+    """Return the residuals whose damper row has the samples in flight alone.
+
+    Well inside the gaps if contact is unknown.
+    """
     m = residuals.motion()
     right, left = m.gaps_m
     inside_gaps = (m.u < 0.9 * right) & (m.u > -0.9 * left)
@@ -124,8 +127,9 @@ def _flight_mask(residuals: LogResiduals) -> Bool2D:
         inside_gaps,
         (residuals.contact_state == 0).all(axis=0),
     )
-    mask: Bool2D = (residuals.entry_row == 0) & in_flight[residuals.entry_sample]
-    return mask
+    mask = residuals.row_mask.copy()
+    mask[0] &= in_flight
+    return replace(residuals, fixed_mask=mask)
 
 
 def _half_masks(residuals: LogResiduals, steps: Sequence[Step]) -> dict[str, Bool2D]:
@@ -188,6 +192,14 @@ def list_fit_warnings(
             )
     for key in joint.at_bound:
         yield f"{key}: at its bound, {joint.values[key]:.4g}; its interval is not valid"
+    for residuals in log_residuals:
+        for nuisance, z in list_sizes(residuals, joint.parameters):
+            if abs(z) > MAX_SIZE:
+                yield (
+                    f"{residuals.signals.name}: the fit needs an error in {nuisance.kind} of "
+                    f"{nuisance.place or 'the set-up'}, {abs(z):.0f} times what is typical: a "
+                    "sensor is wrong, or the specimen differs there; run discover to find it"
+                )
     if BUMPER_STIFFNESS not in joint.values:
         yield "no log touches a bumper: K_j and C_j are those of the start model, gaps as stated"
     else:

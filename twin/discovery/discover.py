@@ -9,27 +9,28 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.errors import InputError
 from table_io.records import Step
-from twin.discovery.candidates import Candidate, list_candidates
-from twin.discovery.least_squares import FitResult, MapFunction, fit_parameters
+from twin.discovery.candidates import list_candidates
+from twin.discovery.least_squares import FitResult, MapFunction, fit_parameters, fit_with_misfit
 from twin.discovery.localization import (
     Localization,
     ResidualCell,
     build_cells,
-    estimate_repeatability_floor,
     find_pulling_bumpers,
     localize_excess,
 )
 from twin.discovery.nuisances import (
-    TYPICAL_LIMITS,
     linearize_nuisances,
     list_nuisance_parameters,
+    resolve_samples,
     sensor_mask,
     widen_intervals,
 )
 from twin.discovery.parameters import (
     INPUT_GAIN,
     INPUT_OFFSET,
+    FreeParameter,
     GapKey,
+    NuisanceKey,
     ParameterSet,
     TareKey,
     list_base_parameters,
@@ -37,19 +38,15 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals, build_log_residuals
 from twin.discovery.selection import (
-    MAX_EFFECTS,
-    MAX_EXPLAINED_COST,
     FittedSet,
     ProgressCallback,
     SelectionProblem,
     SelectionProgress,
     SelectionResult,
-    count_sensor_errors,
     mean_square,
-    stepwise_selection,
+    select_effects,
 )
-from twin.discovery.sensor_checks import compare_sensors
-from twin.discovery.signals import CELL_PAIRS, SENSOR_PAIRS, LogSignals, derives_acc
+from twin.discovery.signals import LogSignals, derives_acc
 from twin.discovery.verdict import (
     DiscoveryVerdict,
     judge_selection,
@@ -59,14 +56,8 @@ from twin.discovery.verdict import (
 from twin.model.model import Model
 
 MIN_ENTRIES, MIN_BLOCKS = 1000, 9
-MAX_IDEAL_ERRORS = 1  # of sensors: several at once are the small ones that every laboratory has
-MAX_NUISANCE_SAMPLES = 60_000  # moving samples of all logs; limits time and memory
 # About the nuisances found before: their products matter in a bad laboratory.
 LINEARIZATION_COUNT = 2
-# Share of the residual with ideal instruments (rms) that the nuisances, which are only so many
-# forms of errors, may leave where they explain it; and the most, as mean square over the noise.
-INSTRUMENT_MISFIT, MAX_INSTRUMENT_MISFIT = 0.01, 3.0
-MODEL_LIMITED_RMS = 50.0  # residual rms over the noise above which model error limits the fit
 MAX_PARAMETER_RATIO = 1.5  # ratio to the model's parameter beyond which the specimen is another one
 
 
@@ -114,9 +105,6 @@ class Discovery:
     map_before: tuple[ResidualCell, ...]
     map_after: tuple[ResidualCell, ...]
     notes: tuple[str, ...]
-    ideal: "Discovery | None" = None  # the same with ideal instruments, where these were tried too
-    # The same with nuisances, where these were tried too and do not explain the recordings either.
-    with_nuisances: "Discovery | None" = None
 
     @property
     def model(self) -> Model:
@@ -140,7 +128,8 @@ def prepare_problem(
 ) -> PreparedProblem:
     """Prepare a selection problem; sensor noise becomes force noise through the fitted stiffness.
 
-    `without` leaves effects out of the library. Raise InputError if there are too few samples.
+    The nuisances of instruments and set-up are always in it. `without` leaves effects out of the
+    library. Raise InputError if there are too few samples.
     """
     if not logs:
         raise InputError("no log is given", remedy="give at least one recording")
@@ -150,98 +139,51 @@ def prepare_problem(
     parameters = initialize_parameters(log_residuals, model)
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
     log_residuals = build_log_residuals(pairs, first.parameters.to_model())
-    first = fit_parameters(log_residuals, first.parameters, mapper=mapper)
-    rms = [_rms(residuals.evaluate(first.parameters)) for residuals in log_residuals]
     notes = []
     if (thinned := log_residuals[0].thinning) > 1:
         notes.append(
             f"the recordings are long: of the cycles of each step only the last are used, one in "
             f"{thinned} and at least two"
         )
-    if min(rms) > MODEL_LIMITED_RMS:
-        log_residuals = build_log_residuals(pairs, first.parameters.to_model(), rms)
-        notes.append(
-            f"the residual is at least {min(rms):.0f} times the noise: model error dominates, so "
-            "every log gets the same weight, regardless of its noise"
-        )
+    log_residuals, first = add_nuisances(log_residuals, first.parameters, mapper)
     library, excluded = list_candidates(log_residuals, parameters, without)
     return PreparedProblem(
-        SelectionProblem(log_residuals, library, mapper, MAX_IDEAL_ERRORS),
-        first,
-        excluded,
-        tuple(notes),
+        SelectionProblem(log_residuals, library, mapper), first, excluded, tuple(notes)
     )
 
 
 def add_nuisances(
-    prepared: PreparedProblem, ideal_cost: float, fitted: FittedSet | None = None
-) -> PreparedProblem:
-    """Return the problem with linear terms for the nuisances of instruments and set-up.
+    log_residuals: Sequence[LogResiduals], first: ParameterSet, mapper: MapFunction = map
+) -> tuple[tuple[LogResiduals, ...], FitResult]:
+    """Return the residuals with linear terms for the nuisances, and the fit of the base with them.
 
-    `ideal_cost` is the mean square over the noise that remains with ideal instruments. Lasers and
-    accelerometers are compared first, on the rows that no force law enters: that gives their noise
-    in motion, and the nuisances about which the terms are linear. Then the forces have their say,
-    with the effects of `fitted` in the model: without one that is there, nuisances would stand in
-    for it.
+    Lasers and accelerometers are compared first, on the rows that no force law enters: that gives
+    their noise in motion, and the nuisances about which the terms are linear. Then the forces have
+    their say.
     """
-    problem, mapper, first = prepared.problem, prepared.problem.mapper, prepared.parameters
-    moving = sum(int(residuals.motion().moving.sum()) for residuals in problem.log_residuals)
-    thinning = max(math.ceil(moving / MAX_NUISANCE_SAMPLES), problem.log_residuals[0].thinning)
-    # Only the ratio of the weights counts: the priors stand against the noise of the best log.
-    log_residuals = tuple(
-        linearize_nuisances(
-            replace(residuals, thinning=thinning, weight=residuals.weight / problem.least_weight),
-            first,
-            mapper=mapper,
-        )
-        for residuals in problem.log_residuals
+    start = first
+    with_terms = tuple(
+        linearize_nuisances(residuals, first, mapper=mapper) for residuals in log_residuals
     )
     fit = fit_parameters(
-        log_residuals,
-        _start_nuisances(log_residuals, first.with_free(())),
-        [sensor_mask(residuals) for residuals in log_residuals],
+        with_terms,
+        _start_nuisances(with_terms, first.with_free(())),
+        [sensor_mask(residuals) for residuals in with_terms],
         mapper=mapper,
     )
     for _ in range(LINEARIZATION_COUNT):
-        log_residuals = tuple(
+        with_terms = tuple(
             linearize_nuisances(residuals, fit.parameters, calibrate=True, mapper=mapper)
-            for residuals in log_residuals
+            for residuals in with_terms
         )
-        start = _start_nuisances(log_residuals, fit.parameters.with_free(first.free))
-        if fitted is not None:
-            start = fitted.add_to(start)
-        fit = fit_parameters(log_residuals, start, mapper=mapper)
-    if fitted is not None and fitted.effects:
-        start = _start_nuisances(log_residuals, fitted.remove_from(fit.parameters))
-        fit = fit_parameters(log_residuals, start, mapper=mapper)
-    return replace(
-        prepared,
-        problem=replace(
-            problem,
-            log_residuals=log_residuals,
-            library=_drop_sound_sensors(problem),
-            max_sensor_errors=MAX_EFFECTS,
-            instrument_misfit=min(INSTRUMENT_MISFIT**2 * ideal_cost, MAX_INSTRUMENT_MISFIT),
-            amplitude_limits=TYPICAL_LIMITS,
-        ),
-        first_fit=fit,
-    )
-
-
-def _drop_sound_sensors(problem: SelectionProblem) -> tuple[Candidate, ...]:
-    """Return the candidates without faults of sensors that agree with another on the same body."""
-    sound = set.intersection(
-        *(
-            {
-                f"sensor_{check.kind}.{channel}"
-                for check in compare_sensors(residuals.signals)
-                if check.kind in ("gain", "lag") and check.is_healthy
-                for channel in check.channels
-            }
-            for residuals in problem.log_residuals
+        fit = fit_with_misfit(
+            with_terms,
+            _start_nuisances(with_terms, fit.parameters.with_free(start.free)),
+            mapper=mapper,
         )
-    )
-    return tuple(candidate for candidate in problem.library if candidate.name not in sound)
+        with_terms = tuple(residuals.with_learned_noise(fit.parameters) for residuals in with_terms)
+    fit = fit_with_misfit(with_terms, fit.parameters, mapper=mapper)
+    return with_terms, fit
 
 
 def _start_nuisances(
@@ -251,15 +193,6 @@ def _start_nuisances(
     nuisances = list_nuisance_parameters(log_residuals)
     start = parameters.with_values({nuisance.key: 0.0 for nuisance in nuisances})
     return start.with_free((*parameters.free, *nuisances))
-
-
-def explain_with_nuisances(prepared: PreparedProblem) -> PreparedProblem:
-    """Return the problem with nuisances if they, but not ideal sensors, explain the logs."""
-    if prepared.base_cost <= MAX_EXPLAINED_COST:
-        return prepared
-    imperfect = add_nuisances(prepared, prepared.base_cost)
-    is_explained = imperfect.first_fit.cost <= MAX_EXPLAINED_COST * imperfect.problem.noise
-    return imperfect if is_explained else prepared
 
 
 def initialize_parameters(log_residuals: Sequence[LogResiduals], model: Model) -> ParameterSet:
@@ -300,7 +233,7 @@ def _input_gain(residuals: LogResiduals) -> float:
 def _check_enough_data(log_residuals: Sequence[LogResiduals]) -> None:
     """Raise InputError if all logs together hold too few samples or cycles, or one holds none."""
     counts = [
-        (residuals.entry_row.size, np.unique(residuals.entry_block).size)
+        (int(residuals.row_mask.sum()), np.unique(residuals.entry_block).size)
         for residuals in log_residuals
     ]
     entries, blocks = (sum(count) for count in zip(*counts, strict=True))
@@ -351,140 +284,75 @@ def discover_effects(
     without: Sequence[str] = (),
     mapper: MapFunction = map,
 ) -> Discovery:
-    """Find the effects that the model lacks by stepwise selection, and judge them (`verdict`).
+    """Find the effects that the model lacks by their evidence (`selection`, `verdict`).
 
     `mapper` may be a parallel map.
     """
     report(SelectionProgress("the model alone"))
     prepared = prepare_problem(logs, model, without, mapper)
-    discovery = _select_and_judge(prepared, logs, model, report)
-    if not discovery.selection.complete or _is_explained(discovery.verdict, MAX_IDEAL_ERRORS):
-        return discovery
-    ideal_cost = prepared.problem.least_weight**2 * discovery.verdict.best.cost
-    imperfect = add_nuisances(prepared, ideal_cost)
-    if not _can_explain(imperfect, discovery):
-        return discovery
-    with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    first = with_nuisances.verdict.best
-    if first.effects and with_nuisances.selection.complete:
-        imperfect = add_nuisances(prepared, ideal_cost, first)
-        with_nuisances = _select_and_judge(imperfect, logs, model, report)
-    best = widen_with_ideal(prepared, with_nuisances.verdict.best)
-    verdict = replace(with_nuisances.verdict, best=best)
-    with_nuisances = replace(with_nuisances, verdict=verdict, ideal=discovery)
-    if not with_nuisances.selection.complete:
-        return replace(discovery, selection=replace(discovery.selection, complete=False))
-    is_ended_early = count_sensor_errors(discovery.selection.best) > MAX_IDEAL_ERRORS
-    if is_ended_early or _is_explained(with_nuisances.verdict):
-        return with_nuisances
-    return replace(discovery, with_nuisances=with_nuisances)
+    selection = select_effects(prepared.problem, prepared.parameters, report, rounds=1)
+    if selection.best.effects and selection.complete:
+        # the errors of instruments were linear about a model without these effects
+        prepared = _linearize_about(prepared, selection.best)
+        selection = select_effects(prepared.problem, prepared.parameters, report, selection.best)
+    return _judge(prepared, selection, logs, model)
 
 
-def widen_with_ideal(prepared: PreparedProblem, fitted: FittedSet) -> FittedSet:
-    """Return a set fitted with nuisances, its intervals widened by what these leave open.
-
-    `prepared` is the problem with ideal instruments.
-    """
-    ideal = _fit_with_effects(prepared, fitted)
-    return replace(fitted, fit=widen_intervals(fitted.fit, ideal, prepared.problem.log_residuals))
-
-
-def _can_explain(imperfect: PreparedProblem, ideal: Discovery) -> bool:
-    """Return True if nuisances can be what the best set with ideal instruments leaves.
-
-    Either instruments disagree, which no force law makes them do, or nuisances close the gap of
-    the base or of the best set. The latter only if no generic term closes it alone with ideal ones:
-    one unknown law says more than the best known ones and many errors of instruments.
-    """
-    best, problem = ideal.verdict.best, ideal.prepared.problem
-    max_cost = MAX_EXPLAINED_COST * imperfect.problem.noise
-    if sensors_disagree(problem, best) or imperfect.first_fit.cost <= max_cost:
-        return True
-    if ideal.verdict.outcome == "unexplained" and any(
-        len(fitted.effects) == 1 and fitted.cost <= MAX_EXPLAINED_COST * problem.noise
-        for fitted in ideal.selection.generic_sets
-    ):
-        return False
-    return _fit_with_effects(imperfect, best).cost <= max_cost
-
-
-def _fit_with_effects(prepared: PreparedProblem, fitted: FittedSet) -> FitResult:
-    """Return the fit of a prepared problem with the effects of a set that was fitted to another."""
-    if not fitted.effects:
-        return prepared.first_fit
-    problem, start = prepared.problem, fitted.add_to(prepared.parameters)
-    return fit_parameters(problem.log_residuals, start, mapper=problem.mapper)
-
-
-def sensors_disagree(problem: SelectionProblem, fitted: FittedSet) -> bool:
-    """Return True if sensors of one body or side differ beyond their noise in any log."""
-    entries = [
-        held_out[residuals.entry_row == row] * residuals.weight
-        for residuals, held_out in zip(problem.log_residuals, fitted.held_out, strict=True)
-        for row, name in enumerate(residuals.rows)
-        if name in SENSOR_PAIRS or name in CELL_PAIRS
-    ]
-    return any(_rms(values) ** 2 > MAX_EXPLAINED_COST for values in entries)
-
-
-def _is_explained(verdict: DiscoveryVerdict, max_sensor_errors: int = MAX_EFFECTS) -> bool:
-    """Return True if the effects explain the recordings to the noise."""
-    return (
-        verdict.outcome != "unexplained"
-        and not verdict.has_remainder
-        and count_sensor_errors(verdict.best) <= max_sensor_errors
+def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedProblem:
+    """Return the problem with nuisances, and noise, about a model with effects."""
+    problem, parameters = prepared.problem, fitted.fit.parameters
+    free = parameters.free
+    log_residuals = tuple(
+        linearize_nuisances(replace(residuals, noise_scale={}), parameters, mapper=problem.mapper)
+        for residuals in problem.log_residuals
     )
+    own = [free_parameter for free_parameter in free if not _is_nuisance(free_parameter)]
+    start = _start_nuisances(log_residuals, parameters.with_free(own))
+    fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
+    base = fitted.remove_from(fit.parameters)
+    log_residuals = tuple(
+        residuals.with_learned_noise(fit.parameters, base) for residuals in log_residuals
+    )
+    first = fit_with_misfit(
+        log_residuals, fitted.remove_from(fit.parameters), mapper=problem.mapper
+    )
+    return replace(prepared, problem=replace(problem, log_residuals=log_residuals), first_fit=first)
 
 
-def _select_and_judge(
+def _is_nuisance(free: FreeParameter) -> bool:
+    return isinstance(free.key, NuisanceKey)
+
+
+def _judge(
     prepared: PreparedProblem,
+    selection: SelectionResult,
     logs: Sequence[PreparedLog],
     model: Model,
-    report: ProgressCallback,
 ) -> Discovery:
-    """Return the selection from a prepared problem, judged; see `discover_effects`."""
+    """Return a selection, judged; see `discover_effects`."""
     problem = prepared.problem
-    selection = stepwise_selection(problem, prepared.parameters, report)
     steps = [log.steps for log in logs]
     # a residual below the noise means that the noise was overestimated
-    floor = min(
-        problem.noise
-        * estimate_repeatability_floor(problem.log_residuals, selection.best.held_out),
-        selection.best.cost,
-    )
+    floor = min(problem.noise, selection.best.cost)
     verdict = widen_for_form(judge_selection(problem, selection, floor))
+    widened = widen_intervals(verdict.best.fit, problem.log_residuals)
+    verdict = replace(verdict, best=replace(verdict.best, fit=widened))
     verdict = qualify_none(problem, verdict)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
-    before = build_cells(problem.log_residuals, selection.null.held_out, floor)
-    localization = localize_excess(problem.log_residuals, selection.null.held_out, before, steps)
-    after = build_cells(problem.log_residuals, verdict.best.held_out, floor)
+    null_samples, of_null = _evaluate_samples(problem, selection.null)
+    before = build_cells(null_samples, of_null, floor)
+    localization = localize_excess(null_samples, of_null, before, steps)
+    after = build_cells(*_evaluate_samples(problem, verdict.best), floor)
     given = evaluate_given(prepared.problem, model)
     return Discovery(prepared, given, selection, verdict, localization, before, after, notes)
 
 
-def fit_known_effects(
-    logs: Sequence[PreparedLog], model: Model, effects: Sequence[str]
-) -> FittedSet | None:
-    """Fit exactly these effects with the base (oracle result); None if one is not a candidate."""
-    prepared = prepare_problem(logs, model)
-    candidates = {candidate.name: candidate for candidate in prepared.problem.library}
-    if not set(effects) <= candidates.keys():
-        return None
-    best = None
-    effects_fitted: list[Candidate] = [candidates[name] for name in effects]
-    for rung in range(max((len(candidate.shapes) for candidate in effects_fitted), default=1)):
-        parameters = prepared.parameters
-        for candidate in effects_fitted:
-            shape = candidate.shapes[min(rung, len(candidate.shapes) - 1)]
-            parameters = candidate.add_to(parameters, shape, _small_amplitude(candidate))
-        fit = fit_parameters(prepared.problem.log_residuals, parameters)
-        if best is None or fit.cost < best.cost:
-            best = fit
-    return prepared.problem.fit_effects(best.parameters, effects_fitted) if best else None
-
-
-def _small_amplitude(candidate: Candidate) -> float:
-    free = candidate.amplitude
-    return min(max(candidate.vanishing + 1e-3 * free.scale, free.low), free.high)
+def _evaluate_samples(
+    problem: SelectionProblem, fitted: FittedSet
+) -> tuple[tuple[LogResiduals, ...], tuple[Float1D, ...]]:
+    """Return (residuals at the samples, their values over the noise for a set, (entry,))."""
+    parameters = fitted.fit.parameters
+    sampled = tuple(resolve_samples(each, parameters) for each in problem.log_residuals)
+    return sampled, tuple(residuals.evaluate(parameters) for residuals in sampled)

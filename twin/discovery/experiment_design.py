@@ -2,11 +2,10 @@
 
 Explanations that the recordings do not separate, the rivals, are fitted sets of effects. A test is
 simulated as if one of them were true, with the noise of the instruments, and every rival is
-refitted to that and the recordings at hand: parameters that absorb the difference, and trajectories
-that only chaos takes apart, separate nothing. What remains is judged as in `verdict`, in standard
-errors from the scatter over the blocks. With d the difference of the residuals of two rivals and b
-that of the true one, the gain is the sum of d^2 + 2 d b, of which the new test is expected to add
-the first term; its mean over the noise is twice the logarithm of the likelihood ratio.
+refitted to that and the recordings at hand: parameters and errors of instruments that absorb the
+difference, and trajectories that only chaos takes apart, separate nothing. With d the difference of
+the residuals of two rivals, over the noise and the unknown errors of instruments, the new test is
+expected to add the sum of d^2 / 2 to the logarithm of the likelihood ratio.
 """
 
 import math
@@ -42,16 +41,13 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import (
-    MIN_GAIN_SHARE,
-    MIN_GAIN_SIGMA,
-    NOISE_UNCERTAINTY,
     FittedSet,
     SelectionProblem,
     SelectionResult,
     mean_square,
 )
 from twin.discovery.signals import LogSignals, build_signals
-from twin.discovery.verdict import MIN_SEPARATION_SIGMA, DiscoveryVerdict
+from twin.discovery.verdict import EXCLUDED_PROBABILITY, DiscoveryVerdict
 from twin.model.model import Model
 from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT
@@ -102,8 +98,9 @@ class Rival:
 class PairSeparation:
     """Expected separation of two rivals by a test, if the one of index `truth` is true.
 
-    `sigma` is the significance with the recordings at hand in standard errors, of which `threshold`
-    exclude the other; `misfit` is what it leaves in the new test, rms over the noise.
+    `sigma` is the significance with the recordings at hand in standard errors: the logarithm of the
+    likelihood ratio is 2 sigma^2, with a standard deviation of 2 sigma. From `threshold` on, as
+    much, it excludes the other; `misfit` is what that leaves in the new test, rms over the noise.
     """
 
     truth: int
@@ -114,8 +111,8 @@ class PairSeparation:
 
     @property
     def probability(self) -> float:
-        """Probability that the other is excluded; the significance scatters by 1 from chance."""
-        return float(ndtr(self.sigma - self.threshold))
+        """Probability that the other is excluded."""
+        return float(ndtr(self.sigma - self.threshold**2 / self.sigma)) if self.sigma > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +158,7 @@ class TestPrediction:
         """
         least = np.array([min(pair.sigma for pair in pairs) for pairs in self._by_truth])
         if self.is_confirmation:
-            least = np.minimum(least, MIN_GAIN_SIGMA)
+            least = np.minimum(least, max(pair.threshold for pair in self.pairs))
         return _mean(2.0 * least * np.abs(least)) / self.motion.minutes
 
     @property
@@ -367,12 +364,7 @@ def _predict_pairs(
                 if linear
                 else _refit_rival(joint, rivals[other].fitted)
             )
-            names, other_names = {*rival.fitted.names}, {*rivals[other].fitted.names}
-            separation = _compare_entries(joint, truth, other, true_entries, entries)
-            if names < other_names or other_names < names:
-                smaller, larger = sorted((true_entries, entries), key=mean_square)[::-1]
-                separation = _require_gain(joint, rival.fitted, smaller, larger, separation)
-            pairs.append(separation)
+            pairs.append(_compare_entries(joint, truth, other, true_entries, entries))
     return TestPrediction(motion, tuple(rivals), tuple(pairs), simulated)
 
 
@@ -399,12 +391,14 @@ def make_residuals(
     number = last.log_number + 1
     signals = build_signals((readings,), motion.name, motion.mass_kg, motion.gaps_m)
     residuals = LogResiduals(
-        number, signals, last.contact_n, last.reference, last.scale, last.weight, last.thinning
-    )
+        number, signals, last.contact_n, last.reference, last.scale, last.weight, last.thinning,
+        noise_scale=last.noise_scale,
+    )  # fmt: skip
     if last.nuisances is None:
         return residuals
     start = _start_rival(fitted, *problem.log_residuals, residuals)
-    return linearize_nuisances(residuals, start, mapper=problem.mapper)
+    residuals = linearize_nuisances(residuals, start, mapper=problem.mapper)
+    return residuals.with_learned_noise(start)
 
 
 def simulate_motion(
@@ -538,45 +532,18 @@ def _compare_entries(
     entries: Sequence[Float1D],
 ) -> PairSeparation:
     """Return the separation from the residuals of the true rival and of another, (entry,) each."""
-    differences = [old - new for old, new in zip(entries, true_entries, strict=True)]
-    squares = [float(difference @ difference) for difference in differences]
-    crosses = [
-        np.bincount(residuals.entry_block, weights=2 * difference * new)
-        for residuals, difference, new in zip(
-            joint.log_residuals, differences, true_entries, strict=True
-        )
-    ]
-    chances = [float(cross @ cross) for cross in crosses]
+    gain = sum(
+        float(old @ old - new @ new)
+        for old, new in zip(entries[:-1], true_entries[:-1], strict=True)
+    )
     # what chance adds to the new test is not expected of another run of it
-    recorded_gain = sum(squares[:-1]) + sum(float(cross.sum()) for cross in crosses[:-1])
-    gain = recorded_gain + squares[-1]
-    # a residual larger than noise is also correlated in time, which the simulated one is not
-    colour = 1.0
-    if mean_square(true_entries[:-1]) > (1 + NOISE_UNCERTAINTY) * mean_square(true_entries[-1:]):
-        recorded = sum(chances[:-1]) / max(sum(squares[:-1]), 1e-300)
-        colour = max(1.0, recorded * squares[-1] / max(chances[-1], 1e-300))
-    chance = sum(chances[:-1]) + colour * chances[-1]
-    return PairSeparation(
-        truth,
-        other,
-        gain / math.sqrt(chance) if chance > 0 else 0.0,
-        math.sqrt(mean_square(entries[-1:])),
-        MIN_SEPARATION_SIGMA,
-    )
+    difference = entries[-1] - true_entries[-1]
+    gain += float(difference @ difference)
+    sigma = math.copysign(math.sqrt(0.25 * abs(gain)), gain)
+    misfit = math.sqrt(mean_square(entries[-1:])) * joint.log_residuals[-1].weight
+    return PairSeparation(truth, other, sigma, misfit, _find_threshold(joint))
 
 
-def _require_gain(
-    joint: SelectionProblem,
-    fitted: FittedSet,
-    worse: tuple[Float1D, ...],
-    better: tuple[Float1D, ...],
-    separation: PairSeparation,
-) -> PairSeparation:
-    """Return the separation of nested rivals: a selection accepts an effect whose gain matters."""
-    before, after = (
-        FittedSet(fitted.effects, replace(fitted.fit, held_out=entries))
-        for entries in (worse, better)
-    )
-    share = joint.compute_gain(before, after)[1]
-    threshold = MIN_GAIN_SIGMA if share > MIN_GAIN_SHARE else math.inf
-    return replace(separation, threshold=threshold)
+def _find_threshold(problem: SelectionProblem) -> float:
+    """Return the standard errors that exclude one explanation of as many as the library has."""
+    return math.sqrt(0.5 * math.log(max(len(problem.library), 1) / EXCLUDED_PROBABILITY))

@@ -18,6 +18,7 @@ from twin.discovery.discover import Discovery, PreparedLog
 from twin.discovery.law_search import LawProposal
 from twin.discovery.localization import PHASES, classify_phases, is_stepped_sine
 from twin.discovery.motion import MeasuredMotion
+from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import GENERIC_PREFIX, ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet
@@ -79,9 +80,28 @@ class DiscoveryView:
     logs: Sequence[PreparedLog]
     proposal: LawProposal | None = None  # then its law stands for the effects
 
-    @property
+    @cached_property
     def log_residuals(self) -> tuple[LogResiduals, ...]:
-        return self.discovery.prepared.problem.log_residuals
+        """Residuals of each log at the samples: what is drawn."""
+        return self._list_samples(self._best)
+
+    def evaluate(self, fitted: FittedSet, log: int) -> Float1D:
+        """Return the residual of a log over its noise at the samples, (entry,)."""
+        return self._list_samples(fitted)[log].evaluate(fitted.fit.parameters)
+
+    def _list_samples(self, fitted: FittedSet) -> tuple[LogResiduals, ...]:
+        """Return the residuals at the samples, less the instrument errors fitted with a set."""
+        known = self._sample_cache.get(id(fitted))
+        if known is None:
+            parameters = fitted.fit.parameters
+            problem = self.discovery.prepared.problem
+            known = tuple(resolve_samples(each, parameters) for each in problem.log_residuals)
+            self._sample_cache[id(fitted)] = known
+        return known
+
+    @cached_property
+    def _sample_cache(self) -> dict[int, tuple[LogResiduals, ...]]:
+        return {}
 
     @property
     def before_after(self) -> Pair:
@@ -303,7 +323,9 @@ def check_instruments(view: DiscoveryView) -> list[InstrumentGate]:
     """Return the sensor checks of every log: consistency of redundant sensors, rest values."""
     gates = []
     for residuals, *held_out in zip(
-        view.log_residuals, *(fitted.held_out for fitted in view.before_after), strict=True
+        view.discovery.prepared.problem.log_residuals,
+        *(fitted.held_out for fitted in view.before_after),
+        strict=True,
     ):
         name = residuals.signals.name
         for row, name_of_row in enumerate(residuals.rows):

@@ -29,7 +29,6 @@ from twin.discovery.localization import ResidualCell
 from twin.discovery.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.result import CandidateResult, DecisiveTest, Verdict
-from twin.discovery.selection import MIN_GAP_SHARE
 from twin.discovery.twin_figures import draw_free_running
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
@@ -281,9 +280,8 @@ def _draw_candidates(verdict: Verdict) -> CaptionedFigures:
     hidden_count = len(candidates) - len(sets)
     caption = (
         "Held-out error of every fitted set of effects, by three-fold cross-validation over the "
-        "steps; the base parameters are refitted with each set. A further effect is selected only "
-        f"if it closes at least {100 * MIN_GAP_SHARE:g} % of the initial misfit and the gain is "
-        "significant."
+        "steps; the base parameters are refitted with each set. What is selected is the most "
+        "probable set, by its evidence."
     )
     caption += f" {hidden_count} worse sets are not drawn." if hidden_count > 0 else ""
     yield CaptionedFigure("candidates", "Candidate effects", caption, figure)
@@ -318,7 +316,7 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
         axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for fitted, colour in zip(view.before_after, (BEFORE_COLOUR, AFTER_COLOUR), strict=True):
             for ax, row_numbers in zip(axes, rows.values(), strict=True):
-                t, squares = _block_means(residuals, fitted.held_out[number], row_numbers)
+                t, squares = _block_means(residuals, view.evaluate(fitted, number), row_numbers)
                 marker_style = (
                     {"ms": 4.5, "mfc": "none"} if colour == BEFORE_COLOUR else {"ms": 2.6}
                 )

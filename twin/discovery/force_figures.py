@@ -240,7 +240,7 @@ def draw_force_histories(view: DiscoveryView) -> CaptionedFigures:
         for ax, row in zip(axes[:, column], rows, strict=True):
             measured = measured_forces(residuals, fitted.fit.parameters)
             error = entries_to_samples(
-                residuals, row, fitted.held_out[view.worst_log], fitted.fit.parameters
+                residuals, row, view.evaluate(fitted, view.worst_log), fitted.fit.parameters
             )
             ax.plot(t, measured[row][k], color=DIRECTION_COLOURS[close_up.direction], lw=2.2)
             model: LineStyle = {"color": TWIN_COLOUR, "lw": 0.9}
@@ -270,7 +270,7 @@ def _find_best_close_up(view: DiscoveryView, residuals: LogResiduals) -> CloseUp
         if residuals.row_mask[row].any()
         for close_up in select_close_ups(residuals, steps, row)
     ]
-    before, after = (fitted.held_out[view.worst_log] for fitted in view.before_after)
+    before, after = (view.evaluate(fitted, view.worst_log) for fitted in view.before_after)
     gain = before**2 - after**2 if view.before_after[1].effects else before**2
 
     def mean_gain(close_up: CloseUp) -> float:

@@ -29,7 +29,9 @@ def compute_force_error(log: PreparedLog, parameters: ParameterSet) -> ForceErro
     """
     kept = {key: value for key, value in parameters.values.items() if get_log(key) is None}
     parameters = replace(parameters, values={**kept, GapKey(0): 0.0}, free=())
-    (residuals,) = build_log_residuals([(log.signals, log.contact_n)], parameters.to_model())
+    (residuals,) = build_log_residuals(
+        [(log.signals.in_whole_band, log.contact_n)], parameters.to_model()
+    )
     m = residuals.motion(parameters.assumed_sensors())
     mass = parameters.model_for_log(0, m).parameters.mass
     used = residuals.row_mask[0]

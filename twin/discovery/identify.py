@@ -29,16 +29,12 @@ from twin.discovery.cross_checks import (
 )  # fmt: skip
 from twin.discovery.discover import (
     PreparedLog,
-    explain_with_nuisances,
     find_implausible_parameters,
     prepare_problem,
 )
-from twin.discovery.least_squares import FitResult, compute_slopes, fit_parameters
+from twin.discovery.least_squares import FitResult, fit_parameters, fit_with_misfit
 from twin.discovery.nuisances import widen_intervals
 from twin.discovery.parameters import (
-    DAMPING,
-    STIFFNESS,
-    BaseKey,
     EffectKey,
     NuisanceKey,
     ParameterKey,
@@ -109,14 +105,11 @@ def identify_parameters(
 
     Raise InputError if a log holds too few usable samples.
     """
-    ideal = prepare_problem(logs, model)
-    prepared = explain_with_nuisances(ideal)
+    prepared = prepare_problem(logs, model)
     problem = prepared.problem
     log_residuals = problem.log_residuals
     joint, fixed = _fit_determined(log_residuals, prepared.parameters)
-    joint = correct_bias(log_residuals, joint)
-    if prepared is not ideal:
-        joint = widen_intervals(joint, ideal.first_fit, log_residuals)
+    joint = widen_intervals(joint, log_residuals)
     p = joint.parameters.to_model().base
     laws = (
         (p.bumper_stiffness_r, p.bumper_damping_r),
@@ -161,88 +154,7 @@ def _fit_determined(
     """Fit the parameters that the logs determine; return (fit, keys of the other parameters)."""
     determined = select_observable(log_residuals, start)
     fixed = tuple(parameter.key for parameter in start.free if parameter not in determined)
-    return fit_parameters(log_residuals, start.with_free(determined)), fixed
-
-
-def correct_bias(log_residuals: Sequence[LogResiduals], fit: FitResult) -> FitResult:
-    """Correct a fit for the bias caused by noise of u and u' (errors in variables).
-
-    With e the noise of the motion, a residual contains -(K e_u + C e_v + M e_a)/s and its slope
-    -e_u/s, so at the true parameters the gradient is not 0 but, per sample of the damper row and
-    of a bumper row,
-
-        b_K = (K var_u + M cov(u, a)) / s^2,   b_C = C var_v / s^2,   b_Kj = K_j var_u / s^2, ...
-
-    and least squares is biased by -H^-1 b. The displacement is fused with the accelerometer, so
-    cov(u, a) = -w^2 P_u summed over frequency: minus the variance of the velocity noise of the
-    mass.
-    """
-    bias = np.zeros(len(fit.free))
-    hessian = np.zeros((bias.size, bias.size))
-    for residuals in log_residuals:
-        before = residuals.evaluate(fit.parameters)
-        rows = np.array(
-            [
-                compute_slopes([residuals], fit.parameters, parameter, [before])[0]
-                for parameter in fit.free
-            ]
-        )
-        hessian += rows @ rows.T
-        m = residuals.motion()
-        if residuals.whitening is not None or (m.damper is None and not m.has_load_cells):
-            continue  # noise whitened, or samples selected by the model: the formula does not hold
-        counts = np.bincount(residuals.entry_row, minlength=3)[:3] / residuals.weight**2
-        with_acc = (
-            m.mass_kg * _shared_noise_variance(residuals.signals) if m.damper is None else 0.0
-        )
-        n, noise = m.noise, residuals.force_noise(m, m.mass_kg)
-        for row, keys in enumerate(((STIFFNESS, DAMPING), *_bumper_keys())):
-            if not counts[row]:
-                continue
-            k, c = (fit.parameters.values[key] for key in keys)
-            share = counts[row] / noise[row] ** 2
-            biases = (k * n.u**2 - (with_acc if row == 0 else 0.0), c * n.v**2)
-            for key, amount in zip(keys, biases, strict=True):
-                bias += [share * amount if key in parameter.keys else 0.0 for parameter in fit.free]
-    size = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-    correction = np.linalg.lstsq(hessian / np.outer(size, size), bias / size, rcond=1e-14)[0] / size
-    values = {
-        parameter.key: parameter.to_external(
-            parameter.to_internal(fit.values[parameter.key]) + float(step)
-        )
-        for parameter, step in zip(fit.free, correction, strict=True)
-        if parameter.key not in fit.at_bound
-    }
-    set_values = {
-        key: values[parameter.key]
-        for parameter in fit.free
-        if parameter.key in values
-        for key in parameter.keys
-    }
-    return replace(
-        fit, parameters=fit.parameters.with_values(set_values), values={**fit.values, **values}
-    )
-
-
-def _bumper_keys() -> tuple[tuple[BaseKey, BaseKey], ...]:
-    return tuple(
-        (BaseKey(f"bumper_stiffness_{side}"), BaseKey(f"bumper_damping_{side}")) for side in "rl"
-    )
-
-
-def _shared_noise_variance(signals: LogSignals) -> float:
-    """Return -cov(u, a) in m2/s2 of the noise that the accelerometer of the mass adds to u."""
-    noise, share = signals.noise, np.ones(signals.omega.size)
-    s_x, s_a = noise.get("mass_disp_m"), noise.get("mass_acc_m_s2")
-    if s_a is None:
-        return 0.0
-    if s_x is None or "table_disp_m" not in noise:
-        if "table_acc_m_s2" not in noise:
-            return 0.0
-        combined = np.hypot(s_a, noise["table_acc_m_s2"])
-        s_x, s_a, share = noise["rel_disp_m"], combined, s_a / combined
-    fused = share * s_a * s_x / np.hypot(s_a, signals.omega**2 * s_x)
-    return signals.grid.white_noise_rms(signals.omega * fused * signals.low_pass) ** 2
+    return fit_with_misfit(log_residuals, start.with_free(determined)), fixed
 
 
 def _estimate_asymmetry(

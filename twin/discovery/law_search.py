@@ -13,12 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from twin.discovery.candidates import Candidate
-from twin.discovery.discover import (
-    Discovery,
-    PreparedProblem,
-    add_nuisances,
-    widen_with_ideal,
-)
+from twin.discovery.discover import Discovery
 from twin.discovery.law_terms import (
     find_law_class,
     list_law_candidates,
@@ -90,97 +85,19 @@ def is_explained(discovery: Discovery) -> bool:
 
 def propose_law(
     discovery: Discovery, report: ProgressCallback = lambda progress: None
-) -> tuple[Discovery, LawProposal | None]:
-    """Return a law for what a discovery leaves unexplained, and the discovery that it belongs to.
+) -> LawProposal | None:
+    """Return a law for what a discovery leaves unexplained.
 
-    No law if nothing is left unexplained, or none helps. The discovery is the one with ideal
-    instruments, or with nuisances, where a law suffices with these.
+    None if nothing is left unexplained, or no law helps.
     """
     if is_explained(discovery):
-        return discovery, None
-    # A law of a few numbers says more than many errors of instruments that do not suffice.
-    ideal = discovery.ideal if discovery.verdict.outcome == "unexplained" else None
-    proposals: list[tuple[Discovery, LawProposal]] = []
-    for tried in filter(None, (ideal, discovery, discovery.with_nuisances)):
-        proposal = _propose_law_of(tried, report)
-        if proposal is not None:
-            proposals.append(proposal)
-            if proposal[1].is_sufficient:
-                break
-    if not proposals:
-        return discovery, None
-    return min(proposals, key=lambda proposal: proposal[1].floor_ratio)
-
-
-def _propose_law_of(
-    discovery: Discovery, report: ProgressCallback
-) -> tuple[Discovery, LawProposal] | None:
-    """Return a law for what the base, or the best effects, of this discovery leave.
-
-    And the discovery with the problem to which the law was fitted.
-    """
+        return None
     verdict, selection = discovery.verdict, discovery.selection
     starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
     singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     nearest_name = nearest.names[0] if nearest else ""
-    prepared = discovery.prepared
-    if discovery.ideal is None:
-        law = find_law(prepared.problem, starts, verdict.floor, nearest_name, report)
-    else:
-        ideal = discovery.ideal.prepared
-        prepared, _, law = find_law_beside_nuisances(
-            ideal, prepared, starts, verdict.floor, nearest_name, report
-        )
-    return None if law is None else (replace(discovery, prepared=prepared), law)
-
-
-def find_law_beside_nuisances(
-    prepared: PreparedProblem,
-    imperfect: PreparedProblem,
-    starts: Sequence[FittedSet],
-    floor: float,
-    nearest: str = "",
-    report: ProgressCallback = lambda progress: None,
-) -> tuple[PreparedProblem, FittedSet, LawProposal | None]:
-    """Return (problem, its base, law) of a problem with nuisances, as `find_law` does.
-
-    `prepared` is the same with ideal instruments. Nuisances that are linear about a model without
-    the law may hide how much the law explains: where none suffices, they are made linear about the
-    best one, and the search is repeated.
-    """
-    problem, null = imperfect.problem, starts[0]
-    fitted_sets = search_laws(problem, starts, report)
-    law = select_law(problem, starts, fitted_sets, floor, nearest)
-    if fitted_sets and (law is None or not law.is_sufficient):
-        imperfect = add_nuisances(prepared, prepared.base_cost, fitted_sets[0])
-        problem = imperfect.problem
-        null = problem.fit_effects(imperfect.parameters, ())
-        law = find_law(problem, [null], floor, nearest, report)
-    if law is None:
-        return imperfect, null, None
-    imperfect, law = refit_nuisances(prepared, law)
-    return imperfect, null, law
-
-
-def refit_nuisances(
-    prepared: PreparedProblem, law: LawProposal
-) -> tuple[PreparedProblem, LawProposal]:
-    """Return a law found with nuisances, fitted with nuisances that are linear about it.
-
-    And the problem with these nuisances. `prepared` is the problem with ideal instruments.
-    Nuisances that were fitted without the law stand in for a part of it.
-    """
-    imperfect = add_nuisances(prepared, prepared.base_cost, law.fitted)
-    start = law.fitted.add_to(imperfect.parameters)
-    refitted = imperfect.problem.fit_effects(start, law.fitted.effects)
-    fitted = widen_with_ideal(prepared, _round_exponents(imperfect.problem, refitted))
-    terms = fitted.effects[len(law.start.effects) :]
-    laws = tuple(
-        _describe_law(imperfect.problem, fitted, term, law.nearest)
-        for term, old in zip(terms, law.laws, strict=True)
-    )
-    return imperfect, replace(law, fitted=fitted, laws=laws, floor=min(law.floor, fitted.cost))
+    return find_law(discovery.prepared.problem, starts, verdict.floor, nearest_name, report)
 
 
 def find_law(
@@ -261,7 +178,7 @@ def _search_from(
     """Return the sets of `start` and one or two terms that were fitted."""
     fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
     for current in fitted_sets[:BEAM_WIDTH]:
-        excess = start.cost - problem.noise
+        excess = start.cost - problem.expected_square
         if _explains(problem, fitted_sets) or start.cost - current.cost < MIN_FIRST_GAIN * excess:
             break
         further = [term for term in library if term.name not in current.names]

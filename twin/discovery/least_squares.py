@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     get_log,
 )
-from twin.discovery.residuals import LogResiduals
+from twin.discovery.residuals import MAX_LEVEL, LogResiduals
 
 MAX_ITERATIONS = 40
 MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
@@ -88,6 +88,39 @@ def fit_parameters(
     out.
     """
     return _LevenbergMarquardt(log_residuals, start, train, folds, mapper).run()
+
+
+def fit_with_misfit(
+    log_residuals: Sequence[LogResiduals],
+    start: ParameterSet,
+    folds: Sequence[Int1D] = (),
+    mapper: MapFunction = map,
+) -> FitResult:
+    """Fit as `fit_parameters`; where the model leaves more than noise, that counts as noise too.
+
+    Else nuisances would run as far as lowers it, whatever their priors. The cost and the
+    cross-validation residual of the result are over the noise alone nevertheless.
+    """
+    fit = fit_parameters(log_residuals, start, folds=folds, mapper=mapper)
+    expected = sum(r.expected_square * r.entry_row.size for r in log_residuals)
+    count = sum(r.entry_row.size for r in log_residuals)
+    if not fit.free or fit.cost * count <= MAX_LEVEL * expected:
+        return fit
+    weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
+    ratios = [new.weight / old.weight for new, old in zip(weighted, log_residuals, strict=True)]
+    fit = fit_parameters(weighted, start, folds=folds, mapper=mapper)
+    entries = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
+    held_out = tuple(
+        np.where(residuals.entry_row < len(residuals.rows), ratio, 1.0) * values
+        for values, residuals, ratio in zip(fit.held_out, log_residuals, ratios, strict=False)
+    )
+    white = min(ratios)
+    return replace(
+        fit,
+        cost=sum(float(values @ values) for values in entries) / count,
+        held_out=held_out,
+        white_errors={key: error / white for key, error in fit.white_errors.items()},
+    )
 
 
 def compute_slopes(

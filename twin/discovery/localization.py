@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import welch
 
-from table_io.block import Float1D, Int1D, Label
+from table_io.block import Float1D, Int1D
 from table_io.records import Step
 from twin.discovery.residuals import PULL_ROWS, LogResiduals
 
@@ -147,73 +147,16 @@ def find_pulling_bumpers(
                 if name in residuals.rows
                 else None
             )
-            if mask is not None and mask.any() and np.mean(r[mask] ** 2) > MIN_PULL_MEAN_SQUARE:
+            if mask is None or not mask.any():
+                continue
+            # of the noise of the sensors, whatever else the weight of a log counts
+            if residuals.weight**2 * np.mean(r[mask] ** 2) > MIN_PULL_MEAN_SQUARE:
                 side = name.split()[0]
                 messages.append(
                     f"{residuals.signals.name}: the {side} bumper pulls after release, as if it "
                     "adhered to the mass; no effect of the library does this"
                 )
     return tuple(messages)
-
-
-def estimate_repeatability_floor(
-    log_residuals: Sequence[LogResiduals], held_out: Sequence[Float1D]
-) -> float:
-    """Return the noise floor: mean square of the residual that does not repeat between cycles.
-
-    The model error is the same in every period of a periodic motion, noise is not. The lower
-    quartile over the steps is used, because chaotic steps never repeat and a transient may remain
-    after a jump. It is 1 without held cycles, and for all rows but the damper row.
-    """
-    variances, shares = [], []
-    for residuals, r in zip(log_residuals, held_out, strict=True):
-        mask = residuals.entry_row == 0
-        samples, values = residuals.entry_sample[mask], r[mask]
-        series = np.full(residuals.signals.step.size, np.nan)
-        series[samples] = values
-        for step_number in np.unique(residuals.signals.step[residuals.signals.step >= 0]):
-            measured = (residuals.signals.step == step_number) & (
-                residuals.signals.label == Label.MEASURE
-            )
-            correlation = residuals.signals.grid.neighbour_correlation
-            variance = _nonrepeating_variance(
-                series, residuals.signals.cycle, np.flatnonzero(measured), correlation
-            )
-            if math.isfinite(variance):
-                variances.append(variance)
-        shares.append(float(mask.mean()))
-    if not variances:
-        return 1.0
-    damper_share = float(np.mean(shares))
-    return damper_share * max(1.0, float(np.percentile(variances, 25))) + 1.0 - damper_share
-
-
-def _nonrepeating_variance(
-    series: Float1D, cycle: Int1D, samples: Int1D, correlation: float
-) -> float:
-    """Return half the variance of the difference of successive periods, at these samples.
-
-    `correlation` is that of the noise of adjacent samples.
-    """
-    if samples.size < 4:
-        return math.nan
-    numbers = cycle[samples]
-    count = int(np.unique(numbers).size)
-    if count < 2:
-        return math.nan
-    period = samples.size / count
-    first_period = samples[samples + math.ceil(period) < samples[-1]]
-    if first_period.size < 8:
-        return math.nan
-    shift, part = math.floor(period), period - math.floor(period)
-    # linear interpolation reduces the noise variance, to one half at part = 1/2 if uncorrelated
-    next_period = (1 - part) * series[first_period + shift] + part * series[
-        first_period + shift + 1
-    ]
-    share = 1.0 + (1 - part) ** 2 + part**2 + 2 * part * (1 - part) * correlation
-    difference = series[first_period] - next_period
-    known = difference[np.isfinite(difference)]
-    return float(np.mean(known**2) / share) if known.size else math.nan
 
 
 def localize_excess(

@@ -133,6 +133,20 @@ def compare_with_white(values: Float1D, gain: Float1D) -> Float1D:
     return np.exp(np.interp(np.log(slow), np.log(bands.frequency), np.log(ratio)))
 
 
+def find_loudest_power(values: Float1D, rate_hz: float) -> NoiseBands:
+    """Return the power of the loudest segment in each band, in Hz; white noise of rms 1 has 1.
+
+    Spectral lines count.
+    """
+    samples = min(SEGMENT_SAMPLES, values.size)
+    hz, _, power = spectrogram(values, rate_hz, "hann", samples, samples // 2, detrend="linear")
+    segments = [
+        _average_bands(hz, 0.5 * rate_hz * segment, 1.0, with_lines=True) for segment in power.T
+    ]
+    loudest = np.max([bands.power for bands in segments], axis=0)
+    return NoiseBands(segments[0].frequency, loudest, segments[0].sigma)
+
+
 def _find_resolution(values: Float1D) -> float:
     """Return the step of a coarsely quantised channel; 0 where nearly all samples differ."""
     levels = np.unique(values)

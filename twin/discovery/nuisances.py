@@ -24,7 +24,7 @@ import numpy.typing as npt
 from numpy.polynomial import Chebyshev
 
 from table_io.block import Bool2D
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.least_squares import FitResult, MapFunction
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
@@ -63,9 +63,7 @@ TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest 
 TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
 TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
-# Share of the change of a parameter due to the nuisances that their assumed forms leave open.
-OPEN_SHARE = 0.005
-MAX_SIZE = 4.0  # typical sizes; a larger error is a fault, and an effect of its own
+MAX_SIZE = 4.0  # typical sizes: a larger error is a fault, or the specimen differs there
 # Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
 TYPICAL_LIMITS: Mapping[str, float] = {
     "sensor_gain": MAX_SIZE * TYPICAL_GAIN,
@@ -98,10 +96,13 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     # The gains of two cells are that of their sum, and their shares.
     scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
-    nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S) for channel in checkable]
+    nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S, "s") for channel in checkable]
     nuisances += [
-        Nuisance(kind, channel, size)
-        for kind, size in (("low_cut", TYPICAL_LOW_CUT), ("resonance", TYPICAL_RESONANCE))
+        Nuisance(kind, channel, size, unit)
+        for kind, size, unit in (
+            ("low_cut", TYPICAL_LOW_CUT, "rad/s"),
+            ("resonance", TYPICAL_RESONANCE, "s2"),
+        )
         for channel in checkable
         if channel in ACCELEROMETERS
     ]
@@ -109,7 +110,9 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
         share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
         size = share * signals.channel_rms(channel)
         nuisances += [
-            Nuisance("offset" + (str(term) if term else ""), channel, size)
+            Nuisance(
+                "offset" + (str(term) if term else ""), channel, size, CHANNEL_BY_NAME[channel].unit
+            )
             for term in range(SLOW_TERMS + 1)
         ]
     for channel in channels:
@@ -124,11 +127,11 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
             Nuisance("share_slope", side, TYPICAL_SHARE_SLOPE),
         ]
         if "table_acc_m_s2" in channels:
-            nuisances.append(Nuisance("plate", side, TYPICAL_PLATE * signals.mass_kg))
+            nuisances.append(Nuisance("plate", side, TYPICAL_PLATE * signals.mass_kg, "kg"))
     if {"mass_acc_m_s2", "table_acc_m_s2"} <= {*channels}:
         nuisances.append(Nuisance("cross", "mass_acc_m_s2", TYPICAL_CROSS))
     if any(math.isfinite(gap) for gap in signals.gaps_m):
-        nuisances.append(Nuisance("gap", "", TYPICAL_GAP_M))
+        nuisances.append(Nuisance("gap", "", TYPICAL_GAP_M, "m"))
     return tuple(nuisances)
 
 
@@ -203,8 +206,9 @@ def linearize_nuisances(
     With `calibrate` the noise of the corrected sensors is taken from their disagreement.
     """
     terms = residuals.nuisances
-    raw = _add_typical_noise(residuals.signals) if terms is None else terms.raw
-    signals = replace(raw)  # a copy, so that the series of its fusion are not kept with the terms
+    raw = residuals.signals if terms is None else terms.raw
+    # a copy, so that the series of its fusion are not kept with the terms
+    signals = _add_typical_noise(raw)
     nuisances = list_nuisances(raw)
     centre = dict.fromkeys(nuisances, 0.0)
     if terms is not None:
@@ -236,6 +240,38 @@ def linearize_nuisances(
         np.array([centre[nuisance] for nuisance, _ in kept]),
     )  # fmt: skip
     return replace(bare, nuisances=terms)
+
+
+def list_sizes(residuals: LogResiduals, parameters: ParameterSet) -> list[tuple[Nuisance, float]]:
+    """Return (nuisance, its value in typical sizes) of a log as fitted."""
+    terms = residuals.nuisances
+    if terms is None:
+        return []
+    sizes = terms.centre + terms.values(parameters)
+    return [*zip(terms.nuisances, sizes.tolist(), strict=True)]
+
+
+def fix_nuisances(residuals: LogResiduals, parameters: ParameterSet) -> LogResiduals:
+    """Return the residuals of signals corrected for the fitted nuisances, without their terms."""
+    terms, signals = residuals.nuisances, residuals.signals
+    if terms is None:
+        return residuals
+    for nuisance, z in zip(terms.nuisances, terms.values(parameters), strict=True):
+        signals = correct_signals(signals, nuisance, float(z))
+    return replace(
+        residuals, signals=signals, nuisances=None, motion_cache=[],
+        known_contact=residuals.contact_state,
+    )  # fmt: skip
+
+
+def resolve_samples(residuals: LogResiduals, parameters: ParameterSet) -> LogResiduals:
+    """Return the residuals with the samples as entries, less the fitted nuisances."""
+    fixed = fix_nuisances(residuals, parameters)
+    signals = fixed.signals.in_whole_band
+    return replace(
+        fixed, signals=signals, is_sampled=True, motion_cache=[],
+        known_contact=residuals.contact_state,
+    )  # fmt: skip
 
 
 def _add_typical_noise(signals: LogSignals) -> LogSignals:
@@ -297,24 +333,23 @@ def sensor_mask(residuals: LogResiduals) -> Bool2D:
 def list_nuisance_parameters(log_residuals: Sequence[LogResiduals]) -> tuple[FreeParameter, ...]:
     """Return the free parameters of the nuisances of all logs."""
     return tuple(
-        FreeParameter(key, -MAX_SIZE - centre, MAX_SIZE - centre, 1.0, "")
+        FreeParameter(key, -math.inf, math.inf, 1.0, "")
         for residuals in log_residuals
         if residuals.nuisances is not None
-        for key, centre in zip(residuals.nuisances.keys, residuals.nuisances.centre, strict=True)
+        for key in residuals.nuisances.keys
     )
 
 
-def widen_intervals(
-    fit: FitResult, ideal: FitResult, log_residuals: Sequence[LogResiduals]
-) -> FitResult:
+def widen_intervals(fit: FitResult, log_residuals: Sequence[LogResiduals]) -> FitResult:
     """Return a fit with nuisances whose standard deviations hold what these leave open.
 
     No sensor contradicts the scale of all displacements: a parameter is as uncertain as it depends
-    on it, which its unit tells, as forces are masses times accelerations. A bumper meets a part of
-    the range of the lasers, with its own slope within their linearity. And the change since the
-    fit `ideal`, without nuisances, depends on their assumed forms.
+    on it, which its unit tells, as forces are masses times accelerations; nor that of a force that
+    was measured by itself, in a component test. A bumper meets a part of
+    the range of the lasers, with its own slope within their linearity.
     """
     std_errors = dict(fit.std_errors)
+    is_component = any("damper_force_n" in r.signals.channels for r in log_residuals)
     for free in fit.free:
         key = free.key
         if is_correction(key):
@@ -326,14 +361,18 @@ def widen_intervals(
         is_bumper = key in (BUMPER_STIFFNESS, BUMPER_DAMPING)
         std_errors[key] = math.hypot(
             std_errors[key],
-            TYPICAL_GAIN * _length_exponent(free.unit) * size,
+            *(TYPICAL_GAIN * power * size for power in _list_exponents(free.unit, is_component)),
             TYPICAL_LINEARITY * size if is_bumper else 0.0,
-            OPEN_SHARE * (value - ideal.values[key]) if key in ideal.values else 0.0,
         )
     return replace(fit, std_errors=std_errors)
 
 
-def _length_exponent(unit: str) -> float:
-    """Return the power with which a quantity in this unit grows with the scale of lengths."""
-    ratio = size_of_unit(unit, force=math.e, length=math.e, time=1.0)
-    return math.log(ratio) if ratio else 0.0
+def _list_exponents(unit: str, is_component: bool) -> tuple[float, ...]:
+    """Return the powers with which a quantity in this unit grows with each unknown scale.
+
+    That of all lengths, forces being masses times accelerations; of a component, whose force is
+    measured by itself, those of lengths and of forces.
+    """
+    scales = ((1.0, math.e), (math.e, 1.0)) if is_component else ((math.e, math.e),)
+    ratios = (size_of_unit(unit, force=f, length=x, time=1.0) for f, x in scales)
+    return tuple(math.log(ratio) if ratio else 0.0 for ratio in ratios)

@@ -14,7 +14,7 @@ Residuals of real rigs are autocorrelated (colored): statistics use blocks, neve
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -22,7 +22,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import binary_opening
 
-from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.discovery.facts import BlockBasis
 from twin.discovery.generic_terms import compute_generic_forces, compute_resonator_force
 from twin.discovery.motion import (
     ConsistencyResidual,
@@ -47,8 +49,15 @@ FORCE_ROWS = ("damper", "right", "left")
 CONTACT_ROWS = ("right", "left")
 TARED_CHANNELS = ("acc", "right", "left")
 PULL_ROWS = ("right pull", "left pull")
+PULLING_CELLS = {"right pull": "right cells", "left pull": "left cells"}
 # of the largest contact force: undershoot of the low pass after a release
 MAX_UNDERSHOOT_SHARE = 0.005
+# Of the force, rms: errors of instruments that no nuisance has the form of.
+UNKNOWN_ERROR_SHARE = 0.002
+# Of the force of a law, rms: what its form in the library leaves of that of a specimen.
+FORM_ERROR_SHARE = 0.02
+MAX_LEVEL = 1.5  # mean square over the noise that may remain where the residual is said to be noise
+MIN_CHANGES = 8  # values of a step that show the noise
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
 MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
@@ -56,11 +65,12 @@ MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Nuisance of a log: kind and place (channel or side), and typical size in its own unit."""
+    """Nuisance of a log: kind and place (channel or side), and typical size in its SI unit."""
 
     kind: str
     place: str
     size: float
+    unit: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +134,13 @@ class LogResiduals:
     thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
     nuisances: NuisanceTerms | None = None
     known_contact: npt.NDArray[np.int8] | None = None  # (2, sample), else from the load cells
+    # What repeated cycles show of the noise of each row, over that of the sensors.
+    noise_scale: Mapping[str, float] = field(default_factory=dict)
+    # Of the residuals that these are a copy of: noise of the rows, and samples of each row.
+    fixed_noise: tuple[Float1D, ...] | None = None
+    fixed_mask: Bool2D | None = None
+    expected_square: float = 1.0  # mean square of entries of noise and unknown errors alone
+    is_sampled: bool = False  # entries are samples, for maps and subsets, in place of facts
     motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
 
     def motion(self, sensors: tuple[SensorModel, ...] = ()) -> MeasuredMotion:
@@ -173,6 +190,8 @@ class LogResiduals:
     @cached_property
     def row_mask(self) -> Bool2D:
         """Sample selection of each residual row, (row, sample)."""
+        if self.fixed_mask is not None:
+            return self.fixed_mask
         m = self.motion()
         used = np.zeros((len(self.rows), m.u.size), dtype=bool)
         used[0] = m.moving & np.isfinite(self.measured_forces(m, m.mass_kg)[0])
@@ -286,9 +305,41 @@ class LogResiduals:
         return sampled
 
     @cached_property
+    def band_hz(self) -> float:
+        """Highest frequency of the facts in Hz: above it the measured forces are noise."""
+        return self.signals.band_hz
+
+    @cached_property
+    def bases(self) -> tuple[BlockBasis | None, ...]:
+        """Components of each row; None for a row whose samples are its entries.
+
+        The rectified noise of a row of tension has a mean, which no component may collect.
+        """
+        if self.is_sampled:
+            return (None,) * len(self.rows)
+        rate_hz = self.motion().rate_hz
+        block = dict.fromkeys(CONTACT_ROWS, self._contact_block)
+        return tuple(
+            None
+            if name in PULL_ROWS
+            else BlockBasis(
+                _split_at_gaps(samples, block.get(name, self.sample_block)), rate_hz, self.band_hz
+            )
+            for name, samples in zip(self.rows, self._row_samples, strict=True)
+        )
+
+    @cached_property
+    def _entry_samples(self) -> tuple[Int1D, ...]:
+        """Sample of each entry of each row: itself, or the middle of the block of a fact."""
+        return tuple(
+            samples if basis is None else samples[basis.middle]
+            for samples, basis in zip(self._row_samples, self.bases, strict=True)
+        )
+
+    @cached_property
     def entry_row(self) -> Int1D:
         """Row of each residual entry, (entry,)."""
-        rows = np.repeat(np.arange(len(self.rows)), self.row_mask.sum(axis=1))
+        rows = np.repeat(np.arange(len(self.rows)), [s.size for s in self._entry_samples])
         return np.concatenate([rows, np.full(self._rest_entry_count, len(self.rows))])
 
     @property
@@ -301,7 +352,7 @@ class LogResiduals:
     def entry_sample(self) -> Int1D:
         """Sample of each residual entry, (entry,)."""
         at_rest = np.zeros(self._rest_entry_count, dtype=np.int64)
-        return np.concatenate([*self._row_samples, at_rest])
+        return np.concatenate([*self._entry_samples, at_rest])
 
     @cached_property
     def entry_block(self) -> Int1D:
@@ -310,7 +361,12 @@ class LogResiduals:
 
     @cached_property
     def entry_contact_block(self) -> Int1D:
-        """Block of each entry, (entry,), without splitting a contact at a block boundary.
+        """Block of each entry, (entry,), without splitting a contact at a block boundary."""
+        return self._contact_block[self.entry_sample]
+
+    @cached_property
+    def _contact_block(self) -> Int1D:
+        """Block of each sample, (sample,), without splitting a contact at a block boundary.
 
         Slow errors of u bias C_j in one direction during compression and in the other during
         restitution; a contact split in two would look like two strong gradients. A contact longer
@@ -322,7 +378,7 @@ class LogResiduals:
         contact_block: Int1D = np.where(
             self.sample_block - start_block <= 1, start_block, self.sample_block
         )
-        return contact_block[self.entry_sample]
+        return contact_block
 
     def measured_forces(
         self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None = None
@@ -490,19 +546,218 @@ class LogResiduals:
         """Return the rows of `evaluate_rows`, each at its own samples."""
         model, sampled = parameters.model_for_log(self.log_number, m), self._sample_motion(m)
         forces = self._force_errors(model, parameters, sampled)
-        # the noise is that of the nominal mass: a misfit must not shrink by its own denominator
-        nominal_mass = model.parameters.mass * self.signals.mass_kg / m.mass_kg
-        noise = self.force_noise(m, nominal_mass)
         places = self._row_places[: len(FORCE_ROWS)]
-        rows = [f[place] / rms for f, place, rms in zip(forces, places, noise, strict=True)]
+        rows = [f[place] for f, place in zip(forces, places, strict=True)]
         if self.whitening is not None:
             # the second derivative at an open end is no force, and the filter would spread it
-            damper = np.where(m.good, forces[0] / noise[0], 0.0)
+            damper = np.where(m.good, forces[0] / self.signals.mass_kg, 0.0)
             rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
         rows += [self._correct_consistency(c, parameters) for c in sampled.consistency]
         if m.has_load_cells and m.damper is None:
             rows += self._pull_rows(sampled, parameters, forces)
-        return rows
+        return [
+            (row if basis is None else basis.project(row)) / noise
+            for row, basis, noise in zip(rows, self.bases, self._row_noise, strict=True)
+        ]
+
+    @cached_property
+    def _row_noise(self) -> tuple[Float1D, ...]:
+        """Rms noise of the entries of each row: a number, or (entry,); that of the readings.
+
+        With assumed sensors it stays the same: a misfit must not shrink by its own denominator.
+        """
+        if self.fixed_noise is not None:
+            return self.fixed_noise
+        m = self.motion()
+        rms = self.force_noise(m, self.signals.mass_kg)
+        if self.whitening is not None:
+            rms[0] = 1.0
+        # rows of rms 1 through a low pass are louder within its band
+        passes = {name: self.signals.pass_of(name) for name in self.rows}
+        in_band = {
+            name: np.array([1.0 / math.sqrt(float(np.mean(gain**2)))])
+            for name, gain in passes.items()
+        }
+        noise = [rms[k : k + 1] for k in range(len(FORCE_ROWS))]
+        for k, basis in enumerate(self.bases):
+            if k >= len(FORCE_ROWS):
+                noise.append(np.ones(1) if basis is None else in_band[self.rows[k]])
+            elif basis is not None:
+                is_whitened = k == 0 and self.whitening is not None
+                noise[k] = in_band[self.rows[k]] if is_whitened else self._fact_noise(k, basis)
+        return tuple(
+            self.noise_scale.get(PULLING_CELLS.get(name, name), 1.0) * each
+            for name, each in zip(self.rows, noise, strict=True)
+        )
+
+    def with_noise_copy(self, copy: int) -> "LogResiduals":
+        """Return the residuals of the readings with noise once more; each `copy` has its own.
+
+        The terms of the nuisances have no noise: they stay as they are.
+        """
+        known = {name: self.noise_scale.get(name, 1.0) for name in self.rows}
+        signals = self.signals.add_noise(copy, known)
+        return replace(
+            self,
+            signals=signals,
+            motion_cache=[],
+            known_contact=self.contact_state,
+            fixed_noise=self._row_noise,
+            fixed_mask=self.row_mask,
+        )
+
+    def with_learned_noise(
+        self, parameters: ParameterSet, base: ParameterSet | None = None
+    ) -> "LogResiduals":
+        """Return the residuals with the noise that they show themselves about a fitted model.
+
+        What does not repeat between the cycles of a step is noise, also where neither the rest nor
+        a quiet band shows it: half the mean square of the difference of successive cycles, the
+        lower quartile over the steps, because chaotic steps never repeat. And instruments err by a
+        share of the force in ways of which no nuisance is a form, the same in every cycle, as do
+        the forms of the laws that the model has beside its `base`, of their own force: the weight
+        counts these errors as noise of single steps.
+        """
+        r = self.evaluate(parameters) * self.weight
+        laws = np.zeros(r.size) if base is None else self.evaluate(base) * self.weight - r
+        scale = dict(self.noise_scale)
+        for row, name in enumerate(self.rows):
+            change = self._measure_change(row, r)
+            if change > 1.0:
+                scale[name] = scale.get(name, 1.0) * math.sqrt(change)
+        learned = replace(self, noise_scale=scale, nuisances=None)
+        measured = learned.measured_entries * learned.weight
+        squares = measured**2
+        errors = (
+            (UNKNOWN_ERROR_SHARE, squares),
+            (FORM_ERROR_SHARE, (laws[self.entry_row < len(self.rows)]) ** 2),
+        )
+        parts = [(share**2 * float(of.sum()), learned._count_different(of)) for share, of in errors]
+        unknown = sum(part for part, _ in parts)
+        weight = math.sqrt(1.0 + sum(part / count for part, count in parts))
+        terms = self.nuisances
+        if terms is not None:
+            ratio = np.concatenate(
+                [
+                    np.full(samples.size, scale.get(name, 1.0) / self.noise_scale.get(name, 1.0))
+                    for name, samples in zip(self.rows, self._entry_samples, strict=True)
+                ]
+            )
+            terms = replace(terms, columns=(terms.columns / ratio).astype(np.float32))
+        expected = (1.0 + unknown / max(squares.size, 1)) / weight**2
+        return replace(learned, weight=weight, expected_square=expected, nuisances=terms)
+
+    def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
+        """Return the residuals with what a fitted model leaves counted as noise of single steps.
+
+        So the priors of the nuisances are not outvoted by a misfit that is no error of theirs.
+        """
+        squares = self.evaluate(parameters)[self.entry_row < len(self.rows)] ** 2
+        excess = max(float(squares.sum()) - self.expected_square * squares.size, 0.0)
+        misfit = excess / self._count_different(squares)
+        return replace(self, weight=self.weight * math.sqrt(1.0 + misfit))
+
+    def _count_different(self, squares: Float1D) -> float:
+        """Return how many different errors entries with these squares are, (entry,).
+
+        As many as there are large ones that do not repeat in each cycle of a step.
+        """
+        steps = np.unique(self.signals.step[self.signals.step >= 0]).size
+        cycles = np.unique(self.sample_block[self._row_samples[0]]).size / max(steps, 1)
+        large = float(squares.sum() ** 2 / max(squares @ squares, 1e-300))
+        return max(large / (cycles if steps else 1.0), 1.0)
+
+    def _measure_change(self, row: int, r: Float1D) -> float:
+        """Return the mean square over the noise that a row does not repeat; 1 if unknown."""
+        basis, facts = self.bases[row], np.flatnonzero(self.entry_row == row)
+        if basis is None or not facts.size:
+            return 1.0
+        sample, m = self.entry_sample[facts], self.motion()
+        measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
+        variances = []
+        for number in np.unique(m.step[sample][measured]):
+            chosen = measured & (m.step[sample] == number)
+            cycles, index = np.unique(m.cycle[sample][chosen], return_inverse=True)
+            order = basis.order[chosen]
+            table = np.full((cycles.size, int(order.max(initial=0)) + 1), np.nan)
+            table[index, order] = r[facts[chosen]]
+            changes = np.diff(table, axis=0)
+            known = changes[np.isfinite(changes)]
+            if known.size >= MIN_CHANGES:
+                variances.append(0.5 * float(np.mean(known**2)))
+        return float(np.percentile(variances, 25)) if variances else 1.0
+
+    def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
+        """Return the rms noise of the components of a force row in N, (fact,)."""
+        p, signals = self.reference.parameters, self.signals
+        k, c = (
+            (p.stiffness, p.damping),
+            (p.bumper_stiffness_r, p.bumper_damping_r),
+            (p.bumper_stiffness_l, p.bumper_damping_l),
+        )[row]
+        hz = basis.frequency_hz
+
+        def at_facts(density: Float1D) -> Float1D:
+            return np.interp(hz, signals.omega / (2 * np.pi), density)
+
+        parts = [at_facts(signals.motion_density) * np.hypot(k, 2 * np.pi * hz * c)]
+        readings = dict.fromkeys((RIGHT_CELLS, LEFT_CELLS)[row - 1], 1.0) if row else {}
+        if row == 0 and "damper_force_n" in signals.channels:
+            readings = {"damper_force_n": 1.0}
+        elif row == 0:
+            readings = dict.fromkeys((*RIGHT_CELLS, *LEFT_CELLS), 1.0)
+            readings["mass_acc_m_s2"] = signals.mass_kg
+        thinned = 1.0 / math.sqrt(signals.grid.decimation)
+        parts += [
+            factor * thinned * at_facts(signals.noise[name])
+            for name, factor in readings.items()
+            if name in signals.noise
+        ]
+        return np.hypot.reduce(parts)
+
+    def enter_forces(self, forces: Float2D) -> Float1D:
+        """Return what forces add to the residual if a model has them, (entry,).
+
+        `forces`, (3, sample) in N, are those of the damper, F_R and -F_L.
+        """
+        m = self.motion()
+        damper, right, left = forces
+        if not m.has_load_cells and m.damper is None:
+            damper = damper + right - left
+        rows = [
+            -values[samples]
+            for values, samples in zip((damper, right, left), self._row_samples, strict=False)
+        ]
+        if self.whitening is not None:
+            whole = np.where(m.good, -damper / self.signals.mass_kg, 0.0)
+            rows[0] = self.signals.grid.apply_gain(whole, self.whitening)[self._row_samples[0]]
+        return self._fill_entries(rows)
+
+    @cached_property
+    def measured_entries(self) -> Float1D:
+        """Measured forces over their noise in the entries of the force rows, (entry,); 0 elsewhere.
+
+        Their norm tells how large a force is beside the noise.
+        """
+        m = self.motion()
+        measured = np.nan_to_num(self.measured_forces(m, self.signals.mass_kg))
+        rows = [
+            values[samples] for values, samples in zip(measured, self._row_samples, strict=False)
+        ]
+        if self.whitening is not None:
+            whole = np.where(m.good, measured[0] / self.signals.mass_kg, 0.0)
+            rows[0] = self.signals.grid.apply_gain(whole, self.whitening)[self._row_samples[0]]
+        return self._fill_entries(rows)
+
+    def _fill_entries(self, rows: Sequence[Float1D]) -> Float1D:
+        """Return entries over the noise, (entry,), from the samples of the force rows."""
+        entries = np.zeros(self.entry_row.size)
+        first = 0
+        for row, basis, noise in zip(rows, self.bases, self._row_noise, strict=False):
+            values = (row if basis is None else basis.project(row)) / noise / self.weight
+            entries[first : first + values.size] = values
+            first += values.size
+        return entries
 
     def _correct_consistency(
         self, consistency: ConsistencyResidual, parameters: ParameterSet
@@ -577,6 +832,13 @@ def build_log_residuals(
         LogResiduals(number, signals, contact_n, reference, scale, weight, thinning)
         for number, ((signals, contact_n), weight) in enumerate(weighted)
     )
+
+
+def _split_at_gaps(samples: Int1D, block: Int1D) -> Int1D:
+    """Return the block of each of some samples, (used,), a new one after each gap between them."""
+    is_new = (np.diff(samples, prepend=-1) > 1) | (np.diff(block[samples], prepend=-1) != 0)
+    numbers: Int1D = np.cumsum(is_new) - 1
+    return numbers
 
 
 def _bound_diverged(entries: Float1D) -> Float1D:

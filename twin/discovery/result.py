@@ -122,6 +122,35 @@ class Remainder(Contract):
     evidence: GenericTerm | None = Field(description="null without a better generic term")
 
 
+class ExplanationResult(Contract):
+    """Explanation of the recordings with its probability."""
+
+    effects: list[str] = Field(description="its effects; empty for none")
+    stranger: str = Field(description="place of an unknown force beside them; empty without one")
+    probability: Misfit = Field(description="of this explanation among all that were compared")
+
+
+class ExcludedSize(Contract):
+    """Largest effect that the recordings exclude beyond: the end of its 95 % interval."""
+
+    id: str = Field(description="the effect")
+    parameter: str = Field(description="its amplitude")
+    value: Real = Field(description="largest deviation from no effect, in `unit`")
+    unit: str = Field(description="unit of the value")
+    force_share: Misfit = Field(description="rms force of it over that of the record")
+
+
+class FittedNuisance(Contract):
+    """Error of an instrument or of the set-up that was fitted beside the model."""
+
+    log: str = Field(description="name of the log")
+    kind: str = Field(description="its form")
+    place: str = Field(description="its channel or side")
+    value: Real = Field(description="size in its unit")
+    unit: str = Field(description="SI unit of the value")
+    typical: Misfit = Field(description="size over that of an ordinary laboratory")
+
+
 class HeldOutLog(Contract):
     """Errors of the damper force on a log that was held out entirely."""
 
@@ -264,6 +293,15 @@ class Verdict(Contract):
     gap: Gap = Field(description="misfit before and after")
     staircase: list[MisfitStep] = Field(
         [], description="misfit from the model as given to the noise floor; absent in old files"
+    )
+    probability: list[ExplanationResult] = Field(
+        [], description="explanations, the most probable first; absent in old files"
+    )
+    excludes: list[ExcludedSize] = Field(
+        [], description="how large each other effect can be at most; absent in old files"
+    )
+    nuisances: list[FittedNuisance] = Field(
+        [], description="errors of instruments beyond their typical size; absent in old files"
     )
     excluded: list[ExcludedSet] = Field(
         [], description="rivals of the effects, best first; absent in old files"

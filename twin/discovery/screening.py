@@ -36,6 +36,12 @@ class Variant:
     column: int
     sign: int  # of the amplitudes allowed: +1, -1, or 0 for both
 
+    def add_to(self, parameters: ParameterSet, amplitude: float) -> ParameterSet:
+        """Add the candidate to a parameter set with so much more than its vanishing amplitude."""
+        free = self.candidate.amplitude
+        start = self.candidate.vanishing + amplitude
+        return self.candidate.add_to(parameters, self.shape, min(max(start, free.low), free.high))
+
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
@@ -221,11 +227,7 @@ class ScreenedCandidate:
 
     def add_to(self, parameters: ParameterSet) -> ParameterSet:
         """Add the candidate to a parameter set with the screened amplitude."""
-        free = self.candidate.amplitude
-        start = self.candidate.vanishing + self.amplitude
-        return self.candidate.add_to(
-            parameters, self.variant.shape, min(max(start, free.low), free.high)
-        )
+        return self.variant.add_to(parameters, self.amplitude)
 
 
 def rank_candidates(equations: NormalEquations, max_count: int) -> tuple[ScreenedCandidate, ...]:

@@ -1,7 +1,7 @@
-"""Stepwise selection of missing effects by cross-validation: addition, elimination, exchange.
+"""Selection of missing effects by their evidence: rank all sets, refit the best, rank again.
 
-Each round screens all candidates by linear least squares around the current fit (`screening`),
-refits the best few on all data, and judges each by three-fold cross-validation over the steps.
+Each round ranks all sets of effects in the linear model about the best fit so far (`evidence`) and
+refits the most probable ones to all data, with cross-validation residuals over the steps.
 """
 
 import math
@@ -14,9 +14,10 @@ import numpy as np
 
 from table_io.block import Float1D, Int1D
 from twin.discovery.candidates import Candidate, list_generic_candidates
-from twin.discovery.least_squares import FitResult, MapFunction, fit_parameters
+from twin.discovery.evidence import Hypothesis, LinearEvidence, build_evidence, softmax
+from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
-from twin.discovery.residuals import CONTACT_ROWS, LogResiduals
+from twin.discovery.residuals import LogResiduals
 from twin.discovery.screening import (
     NormalEquations,
     ScreenedCandidate,
@@ -27,13 +28,14 @@ from twin.discovery.screening import (
 
 MAX_EFFECTS = 3
 MAX_EXPLAINED_COST = 1.1  # mean square over the noise: with less, nothing is left to explain
-MAX_REFITS, MAX_GENERIC_REFITS = 5, 2  # candidates refitted in a round
+MAX_ROUNDS = 3  # of rankings, each about the best fit of the one before
+REFIT_NATS, MAX_REFITS = 5.0, 4  # below the best log evidence; sets refitted in a round
+MAX_GENERIC_REFITS = 2
+MIN_AMPLITUDE_SHARE = 1e-9  # of the scale of an amplitude: with less an effect is none
+MIN_PROBABILITY = 1e-3  # of an explanation that is reported
 MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
 MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
-NOISE_UNCERTAINTY = 0.15  # of its mean square, which a rest of some seconds shows to 7 % in rms
-MIN_GAP_SHARE = 0.02  # of the initial gap that a second or third effect must close
-OFFSETS = ("gap_offset", "sensor_offset")  # a constant has no form that could be inexact
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
 MIN_ROW_SHARE = 0.01  # of all entries: a smaller row is not judged by itself
@@ -56,9 +58,29 @@ class FittedSet:
         return self.fit.held_out
 
     @property
+    def squares(self) -> float:
+        """Sum of squares of the residual over the noise, fitted to all data."""
+        return self.fit.cost * sum(values.size for values in self.held_out)
+
+    def find_shape(self, effect: Candidate) -> tuple[float, ...]:
+        """Return the fitted shape of one of the effects, in the order of its trial shapes."""
+        values = self.fit.parameters.values
+        return tuple(values[free.key] for free in effect.free if free is not effect.amplitude)
+
+    @property
     def cost(self) -> float:
         """Mean square of the cross-validation residual over the noise."""
         return mean_square(self.held_out)
+
+    @property
+    def has_vanished(self) -> bool:
+        """True if an effect is of no size: not one of the set, whatever promised it."""
+        values = self.fit.parameters.values
+        return any(
+            abs(values[effect.amplitude.key] - effect.vanishing)
+            < MIN_AMPLITUDE_SHARE * effect.amplitude.scale
+            for effect in self.effects
+        )
 
     def add_to(self, parameters: ParameterSet) -> ParameterSet:
         """Add the effects, free, to a parameter set at their fitted values."""
@@ -107,33 +129,11 @@ class SelectionProblem:
     log_residuals: tuple[LogResiduals, ...]
     library: tuple[Candidate, ...]
     mapper: MapFunction = map
-    # Ideal instruments are no explanation with more errors of sensors: they end the selection.
-    max_sensor_errors: int = MAX_EFFECTS
-    # Mean square over the noise of what instruments leave that err in other ways than assumed.
-    instrument_misfit: float = 0.0
-    # Smallest deviation of the amplitude from its vanishing value, by effect.
-    amplitude_limits: Mapping[str, float] = field(default_factory=dict)
 
     def fit_effects(self, start: ParameterSet, effects: Sequence[Candidate]) -> FittedSet:
         """Fit `start`, with these effects added, to all data, with cross-validation residuals."""
-        result = fit_parameters(self.log_residuals, start, folds=self.folds, mapper=self.mapper)
+        result = fit_with_misfit(self.log_residuals, start, self.folds, self.mapper)
         return FittedSet(tuple(effects), result)
-
-    def is_admissible(self, fitted: FittedSet) -> bool:
-        """Return True if every effect exceeds the limit of its amplitude."""
-        return all(
-            abs(fitted.fit.values[effect.amplitude.key] - effect.vanishing)
-            > self.amplitude_limits[effect.effect.id]
-            for effect in fitted.effects
-            if effect.effect is not None and self.is_limited(effect)
-        )
-
-    def is_limited(self, candidate: Candidate) -> bool:
-        """Return True for a fault of an instrument or of the set-up whose amplitude has a limit.
-
-        Where the residual is noise such a fault has nothing to explain.
-        """
-        return candidate.effect is not None and candidate.effect.id in self.amplitude_limits
 
     @property
     def least_weight(self) -> float:
@@ -142,19 +142,14 @@ class SelectionProblem:
 
     @property
     def noise(self) -> float:
-        """Mean square of what instruments alone leave: below it no effect is named."""
-        return (1.0 + self.instrument_misfit) * self.least_weight**-2
+        """Mean square of what instruments leave."""
+        return self.least_weight**-2
 
-    def is_noise(self, null: FittedSet, best: FittedSet) -> bool:
-        """Return True if the base alone leaves hardly more than noise, and the best set as much.
-
-        In every row: a bumper that is touched for moments leaves its mark in a small one.
-        """
-        limit = 1 + NOISE_UNCERTAINTY
-        before, after = self.mean_squares(null), self.mean_squares(best)
-        return null.cost < limit * min(self.noise, best.cost) and all(
-            before[name] < limit * max(self.noise, after[name]) for name in before
-        )
+    @property
+    def expected_square(self) -> float:
+        """Mean square of the entries where the model is right: noise, and unknown errors."""
+        squares = [r.expected_square * r.entry_row.size for r in self.log_residuals]
+        return sum(squares) / sum(r.entry_row.size for r in self.log_residuals)
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
@@ -201,27 +196,28 @@ class SelectionProblem:
         return share > 0 and row > MIN_GAIN_SHARE and errors > MIN_GAIN_SIGMA
 
 
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """Names of effects, the place of a stranger beside them or "", and their probability."""
+
+    names: tuple[str, ...]
+    place: str
+    probability: float
+
+
 @dataclass(frozen=True, eq=False)
 class SelectionResult:
-    """Outcome of a selection: the null (base alone), the best set, and every set refitted."""
+    """Outcome of a selection: the null (base alone), the best set, and every set refitted.
+
+    `explanations` are the most probable first. `evidence` is the linear model about the best set.
+    """
 
     null: FittedSet
     best: FittedSet
     tried: tuple[FittedSet, ...] = field(default=())
-    generic_sets: tuple[FittedSet, ...] = field(default=())  # sets with a generic term
     complete: bool = True  # False after a cancellation
-
-    def find_gap_start(self, fitted: FittedSet) -> FittedSet:
-        """Return the set from which the gap that a set closes is counted.
-
-        The null; with its offsets alone, if the set has such and more: a channel that was not tared
-        or a gap that was read wrongly may dwarf every law.
-        """
-        offsets = {effect.name for effect in fitted.effects if is_offset(effect)}
-        if not offsets or len(offsets) == len(fitted.effects):
-            return self.null
-        starts = [tried for tried in self.tried if {*tried.names} == offsets]
-        return min(starts, key=lambda tried: tried.cost, default=self.null)
+    explanations: tuple[Explanation, ...] = ()
+    evidence: LinearEvidence | None = None
 
 
 class Cancelled(Exception):
@@ -230,103 +226,107 @@ class Cancelled(Exception):
     fitted: tuple[FittedSet, ...] = ()  # sets completed in the cancelled round
 
 
-def stepwise_selection(
-    problem: SelectionProblem, start: ParameterSet, report: ProgressCallback = lambda progress: None
+def select_effects(
+    problem: SelectionProblem,
+    start: ParameterSet,
+    report: ProgressCallback = lambda progress: None,
+    first: FittedSet | None = None,
+    rounds: int = MAX_ROUNDS,
 ) -> SelectionResult:
-    """Select effects stepwise from the base alone; each addition puts the earlier ones in doubt."""
+    """Select the most probable set of effects; see `evidence`.
+
+    The linear model about a fit ranks all sets; the best are refitted, and ranked again about the
+    best of them, until no other set is more probable or all `rounds` are over. `first` is a set to
+    begin with, fitted to another problem.
+    """
     null = problem.fit_effects(start, ())
-    state = SelectionResult(null, null)
+    state, refitted = SelectionResult(null, null), {frozenset[str](): null}
+    if first is not None:
+        state = replace(state, best=problem.fit_effects(first.add_to(start), first.effects))
+        refitted[frozenset(first.names)] = state.best
     try:
-        while len(state.best.effects) < MAX_EFFECTS:
-            previous, state = state.best, _forward_step(problem, state, report)
-            if state.best is previous:  # it was revised when it was accepted
+        for _ in range(rounds):
+            before = state.best
+            state = _advance(problem, state, refitted, report)
+            if {*state.best.names} == {*before.names}:
                 break
-            if problem.is_noise(state.null, state.best):  # a second effect would fit noise, too
-                return replace(state, best=state.null)
-            state = revise_step(problem, state, report)
-            if count_sensor_errors(state.best) > problem.max_sensor_errors:
-                return state
-            state = replace(state, null=_refit_null(problem, state.null, state.best))
-        return replace(state, generic_sets=_fit_generic_terms(problem, state, report))
-    except Cancelled as cancelled:
-        return replace(_accept_best(problem, state, cancelled.fitted), complete=False)
+        return state
+    except Cancelled:
+        tried = tuple(fitted for names, fitted in refitted.items() if names)
+        best = min((state.best, *tried), key=lambda fitted: fitted.cost)
+        return replace(state, best=best, tried=tried, complete=False)
 
 
-def is_offset(effect: Candidate) -> bool:
-    """Return whether an effect is a constant error of an instrument or of the set-up."""
-    return effect.effect is not None and effect.effect.id in OFFSETS
-
-
-def count_sensor_errors(fitted: FittedSet) -> int:
-    """Return the number of errors of sensors in a set of effects."""
-    return sum(bool(effect.channel) for effect in fitted.effects)
-
-
-def _forward_step(
-    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
+def _advance(
+    problem: SelectionProblem,
+    state: SelectionResult,
+    refitted: dict[frozenset[str], FittedSet],
+    report: ProgressCallback,
 ) -> SelectionResult:
-    """Add the best further effect, if it is worthwhile."""
-    return _accept_best(problem, state, _refit_candidates(problem, state.best, state.best, report))
-
-
-def _accept_best(
-    problem: SelectionProblem, state: SelectionResult, fitted_sets: Sequence[FittedSet]
-) -> SelectionResult:
-    """Accept the best set of a round, if it is worthwhile."""
-    current, tried = state.best, (*state.tried, *fitted_sets)
-    best = min(fitted_sets, key=lambda fitted: fitted.cost, default=current)
-    state = replace(state, tried=tried)
-    return replace(state, best=best) if _is_needed(problem, state, current, best) else state
-
-
-def _is_needed(
-    problem: SelectionProblem, state: SelectionResult, without: FittedSet, with_effect: FittedSet
-) -> bool:
-    """Return True if an effect is worthwhile and, beside others, closes enough of the gap.
-
-    Of all rows, or of a contact row if it acts in the bumpers: there an inexact form of a law of
-    the damper leaves nothing.
-    """
-    if not problem.is_worthwhile(without, with_effect):
-        return False
-    if not without.effects:
-        return True
-    start = state.find_gap_start(with_effect)
-    if without.cost - with_effect.cost >= MIN_GAP_SHARE * (start.cost - with_effect.cost):
-        return True
-    (added,) = (effect for effect in with_effect.effects if effect.name not in without.names)
-    if added.effect is None or not added.effect.is_in_bumpers:
-        return False
-    initial, before, after = map(problem.mean_squares, (start, without, with_effect))
-    return any(
-        before[row] - after[row]
-        > max(MIN_GAIN_SHARE * before[row], MIN_GAP_SHARE * (initial[row] - after[row]))
-        for row in CONTACT_ROWS
-        if row in before
+    """Rank all sets about the base of the best fit so far, and refit the most probable ones."""
+    current = state.best
+    base = current.remove_from(current.fit.parameters)
+    known_shapes = {
+        effect.name: fitted.find_shape(effect)
+        for fitted in (*refitted.values(), current)
+        for effect in fitted.effects
+    }
+    report(SelectionProgress("all effects", best=current))
+    rich = tuple((effect.name, known_shapes[effect.name]) for effect in current.effects)
+    linear = build_evidence(
+        problem.log_residuals, base, problem.library, known_shapes, rich, problem.mapper
     )
+    states = linear.rank_states(MAX_EFFECTS)
+    for index in range(1, MAX_REFITS + 1):
+        states = _drop_refuted(linear, states, refitted)
+        each = _find_open(linear, states, refitted)
+        if each is None:
+            break
+        variants = [linear.variants[c] for c in each.columns]
+        names = tuple(variant.candidate.name for variant in variants)
+        report(SelectionProgress("the most probable sets", names, index, MAX_REFITS, current))
+        parameters = base
+        for variant, amplitude in zip(variants, linear.estimate(each.columns)[0], strict=True):
+            parameters = variant.add_to(parameters, float(amplitude))
+        effects = tuple(variant.candidate for variant in variants)
+        refitted[frozenset(names)] = problem.fit_effects(parameters, effects)
+    states = _drop_refuted(linear, states, refitted)
+    best = next(refitted[linear.names(each)] for each in states if linear.names(each) in refitted)
+    explanations = tuple(
+        Explanation(tuple(sorted(linear.names(each))), each.place, float(p))
+        for each, p in zip(states, softmax(states), strict=True)
+        if p > MIN_PROBABILITY
+    )
+    tried = tuple(fitted for names, fitted in refitted.items() if names)
+    return replace(state, best=best, tried=tried, explanations=explanations, evidence=linear)
 
 
-def revise_step(
-    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
-) -> SelectionResult:
-    """Drop each earlier effect that is not needed beside the last, or replace it by a better one.
+def _find_open(
+    linear: LinearEvidence,
+    states: Sequence[Hypothesis],
+    refitted: Mapping[frozenset[str], FittedSet],
+) -> Hypothesis | None:
+    """Return the most probable state whose set has not been refitted; None if all near ones have.
 
-    What was the best first effect may only have stood in for a later one. `state` is that after the
-    last effect was added, with every set refitted until then.
+    More effects that are less probable only add noise to what the best says.
     """
-    for earlier in state.best.effects[:-1]:
-        reduced = fit_without(problem, state.best, earlier)
-        costs = [each.cost for each in state.tried if len(each.effects) == len(reduced.effects)]
-        state = replace(state, tried=(*state.tried, reduced))
-        if reduced.cost < min(costs) and not _is_needed(problem, state, reduced, state.best):
-            state = replace(state, best=reduced)
-            continue
-        fitted_sets = _refit_candidates(problem, state.best, reduced, report)
-        state = replace(state, tried=(*state.tried, *fitted_sets))
-        best = min(fitted_sets, key=lambda fitted: fitted.cost, default=state.best)
-        if problem.is_worthwhile(state.best, best):
-            state = replace(state, best=best)
-    return state
+    for each in states:
+        names = linear.names(each)
+        if each.log_evidence < states[0].log_evidence - REFIT_NATS:
+            break
+        if names not in refitted and not linear.names(states[0]) < names:
+            return each
+    return None
+
+
+def _drop_refuted(
+    linear: LinearEvidence,
+    states: Sequence[Hypothesis],
+    refitted: Mapping[frozenset[str], FittedSet],
+) -> list[Hypothesis]:
+    """Return the states without the sets of which an effect vanishes when they are refitted."""
+    refuted = [names for names, fitted in refitted.items() if fitted.has_vanished]
+    return [each for each in states if not any(names <= linear.names(each) for names in refuted)]
 
 
 def fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
@@ -335,89 +335,15 @@ def fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate
     return problem.fit_effects(dropped.remove_from(fitted.fit.parameters), kept)
 
 
-def _fit_generic_terms(
-    problem: SelectionProblem, state: SelectionResult, report: ProgressCallback
-) -> tuple[FittedSet, ...]:
-    """Fit generic terms alone, in addition to the best effects, and in place of each of them."""
-    best = state.best
+def fit_generic_terms(problem: SelectionProblem, start: FittedSet) -> tuple[FittedSet, ...]:
+    """Return a set with each of the best generic terms added."""
     library = list_generic_candidates(problem.log_residuals)
-
-    def report_best(progress: SelectionProgress) -> None:
-        # a generic term is never reported as the best set
-        report(replace(progress, best=best))
-
-    starts = [state.null]
-    if best.effects:
-        starts.append(best)
-    if len(best.effects) > 1:
-        starts += [fit_without(problem, best, replaced) for replaced in best.effects]
+    parameters = start.fit.parameters
+    equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
     return tuple(
-        fitted
-        for start in starts
-        for fitted in _refit_candidates(
-            problem, best if start.effects else start, start, report_best, library
-        )
+        problem.fit_effects(screened.add_to(parameters), (*start.effects, screened.candidate))
+        for screened in select_promising(equations, MAX_GENERIC_REFITS)
     )
-
-
-def _refit_null(problem: SelectionProblem, null: FittedSet, best: FittedSet) -> FittedSet:
-    """Refit the null from the best set's parameters; an unconverged null causes false alarms."""
-    refitted = problem.fit_effects(best.remove_from(best.fit.parameters), ())
-    return refitted if refitted.cost < null.cost else null
-
-
-def _refit_candidates(
-    problem: SelectionProblem,
-    current: FittedSet,
-    start: FittedSet,
-    report: ProgressCallback,
-    library: Sequence[Candidate] | None = None,
-) -> list[FittedSet]:
-    """Screen the candidates, then refit the best additions to a start set on all data.
-
-    The start is `current`, or the same without an effect that is to be replaced.
-    """
-    kept, parameters, generic = start.effects, start.fit.parameters, library is not None
-    replaced_names = {*current.names} - {*start.names}
-    count = len(kept) + 1
-    stage = "generic terms" if generic else f"{count} effect{'s' if count > 1 else ''}"
-    stage += "".join(f", replacing {name}" for name in replaced_names)
-    report(SelectionProgress(stage, best=current))
-    kept_keys = {free.key for effect in kept for free in effect.free}
-    max_refits = MAX_GENERIC_REFITS if generic else MAX_REFITS
-    if library is None:
-        library = [
-            candidate
-            for candidate in problem.library
-            if candidate.name not in start.names
-            and kept_keys.isdisjoint(free.key for free in candidate.free)
-            and candidate.name not in replaced_names
-            and not (current.cost < problem.noise and problem.is_limited(candidate))
-        ]
-    if not library:
-        return []
-    fitted_sets: list[FittedSet] = []
-    promising = select_promising(
-        build_normal_equations(problem.log_residuals, parameters, library, problem.mapper),
-        max_refits,
-    )
-    for index, screened in enumerate(promising, 1):
-        effects = (*kept, screened.candidate)
-        completed = () if generic else tuple(fitted_sets)
-        best = min((current, *completed), key=lambda fitted: fitted.cost)
-        try:
-            report(
-                SelectionProgress(
-                    stage, tuple(effect.name for effect in effects), index, len(promising), best
-                )
-            )
-        except Cancelled as cancelled:
-            cancelled.fitted = completed
-            raise
-        fitted = problem.fit_effects(screened.add_to(parameters), effects)
-        if problem.is_admissible(fitted):
-            fitted_sets.append(fitted)
-    return fitted_sets
 
 
 def select_promising(equations: NormalEquations, max_count: int) -> list[ScreenedCandidate]:

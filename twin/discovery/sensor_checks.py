@@ -108,6 +108,7 @@ def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
 
 def compare_sensors(signals: LogSignals) -> Iterator[SensorCheck]:
     """Yield the checks of each accelerometer against the laser on the same body."""
+    signals = signals.in_whole_band
     for channels in SENSOR_PAIRS.values():
         if {*channels} <= {*signals.channels}:
             position, acc = channels[0], channels[1]
@@ -135,14 +136,14 @@ def _compare_pair(
     if strong.sum() < 10:
         return
     valid = _select_valid(signals)
+    if not valid.any():
+        return
     # what is cut out of a record mixes its frequencies
-    used = strong if valid.all() or not valid.any() else signals.omega > 0
+    used = signals.omega > 0
     omega = signals.omega[used]
 
     def observe(values: Spectrum) -> Spectrum:
         """Return the strong frequencies of what is seen of a signal, from those used."""
-        if used is strong:
-            return values
         spectrum = np.zeros(used.size, dtype=np.complex128)
         spectrum[used] = values
         return _cut_spectrum(signals, spectrum, valid)[strong]
@@ -179,15 +180,13 @@ def _compare_pair(
 
 
 def _select_valid(signals: LogSignals) -> Bool2D:
-    """Return the samples to compare, (sample,): of a record with lost ones not its ends either.
+    """Return the samples to compare, (sample,): not the ends, where a mass may still move.
 
-    What a spectrum leaves at the ends of a record is small beside the whole of it, not beside what
-    losses may leave.
+    A displacement that does not end at zero has no acceleration there, only a step.
     """
     valid = signals.good.copy()
-    if not valid.all():
-        margin = round(OPEN_END_S * signals.grid.rate_hz / signals.grid.decimation)
-        valid[:margin] = valid[valid.size - margin :] = False
+    margin = round(OPEN_END_S * signals.grid.rate_hz / signals.grid.decimation)
+    valid[:margin] = valid[valid.size - margin :] = False
     return valid
 
 
@@ -241,7 +240,10 @@ def _fit_ratio(values: Float1D, reference: Float1D) -> tuple[float, float]:
 
 
 def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorCheck]:
-    """Yield the lags and the gaps of the fit."""
+    """Yield the gaps of the fit, and a resonance of an accelerometer on its bracket.
+
+    Lags are judged by pairs of sensors alone: a force law that is wrong would move them.
+    """
     signals, terms, number = residuals.signals, residuals.nuisances, residuals.log_number
     unequal = unequal_sd = 0.0
     known = zip(terms.nuisances, terms.centre, strict=True) if terms else ()
@@ -251,8 +253,6 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
         sd = nuisance.size * fit.std_errors.get(key, 0.0)
         if nuisance.kind == "gap":
             unequal, unequal_sd = value, sd
-        elif nuisance.kind == "lag":
-            yield _check_estimate(signals, "lag", (nuisance.place,), value, sd, MAX_LAG_S, "s")
         elif (
             # beside an anti-alias filter the difference of two filters looks like a resonance
             nuisance.kind == "resonance"

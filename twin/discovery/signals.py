@@ -19,6 +19,7 @@ from twin.discovery.noise import (
     RestNoise,
     compare_with_white,
     estimate_noise_density,
+    find_loudest_power,
     measure_rest_noise,
 )
 from twin.discovery.spectra import (
@@ -32,6 +33,11 @@ LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the inte
 OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
 # Of the power of a drive with a single frequency: within this width, of the frequency, about it.
 MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
+# Power over that of the noise above which a band holds forces, and the share of the corner of a
+# filter, or of the Nyquist frequency, up to which a channel is as it was measured.
+MIN_BAND_RATIO, BAND_OF_FILTER = 4.0, 0.7
+BAND_ROLL_OFF = 2.0  # end of the low pass of all channels over the end of that band
+NOISE_SEED = 20_26  # of the copies of the noise: the same recording gives the same verdict
 MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
 BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
@@ -71,11 +77,22 @@ class LogSignals:
     cycle: Int1D
     good: Bool2D
     rest_noise: Mapping[str, RestNoise] = field(default_factory=dict)  # where there is a rest
+    band_hz: float = math.inf  # highest frequency at which the measured forces exceed their noise
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
 
     @property
     def channels(self) -> tuple[str, ...]:
         return tuple(self.spectra)
+
+    def pass_of(self, row: str) -> Float1D:
+        """Return the low pass of a row that compares sensors, (frequency,)."""
+        is_whole = row in CELL_PAIRS and not derives_acc(self.channels)
+        return self.grid.low_pass if is_whole else self.low_pass
+
+    @property
+    def in_whole_band(self) -> "LogSignals":
+        """The signals up to the Nyquist frequency, with the steps of the forces as they are."""
+        return replace(self, low_pass=self.grid.low_pass, band_hz=math.inf)
 
     @property
     def filter_hz(self) -> float:
@@ -154,6 +171,58 @@ class LogSignals:
         density = np.divide(self.low_pass, gain, out=np.zeros_like(gain), where=gain > 0)
         return self.grid.white_noise_rms(density * self.low_pass)
 
+    def find_force_band(self) -> float:
+        """Return the highest frequency in Hz at which the measured forces exceed their noise.
+
+        The forces are those of inertia, of the load cells and of a component. Above it, and above
+        the corner of an anti-alias filter, a residual holds noise alone.
+        """
+        hz, top = self.omega / (2.0 * np.pi), 0.0
+        rate_hz = self.grid.rate_hz / self.grid.decimation
+        moving = self.good & (self.label != Label.REST)
+        names = (*RIGHT_CELLS, *LEFT_CELLS, "damper_force_n", "mass_acc_m_s2")
+        present = [name for name in names if name in self.spectra]
+        for name in present or [name for name in ("table_acc_m_s2",) if name in self.spectra]:
+            values = self.grid.to_time_domain(self.spectra[name] * self.low_pass)[moving]
+            bands = find_loudest_power(values, rate_hz)
+            noise = np.interp(bands.frequency, hz, self.noise[name]) / math.sqrt(
+                self.grid.decimation
+            )
+            loud = bands.power > MIN_BAND_RATIO * noise**2
+            top = max(top, float(bands.frequency[loud].max(initial=0.0)))
+        limit = BAND_OF_FILTER * min(self.filter_hz, 0.5 * rate_hz)
+        return max(min(top, limit), 4.0 * hz[1])
+
+    @property
+    def motion_density(self) -> Float1D:
+        """Return the noise density in m of the displacement at its rate, (frequency,).
+
+        The errors of the lasers in motion are slow: they lie in the band of the forces.
+        """
+        density = self._fusion.density / math.sqrt(self.grid.decimation)
+        rate_hz = self.grid.rate_hz / self.grid.decimation
+        count = 2 if "mass_disp_m" in self.spectra else 1
+        slow = self.surface_noise_m * math.sqrt(count * 0.5 * rate_hz / self.band_hz)
+        return np.hypot(density, slow)
+
+    def add_noise(self, copy: int, scale: Mapping[str, float]) -> "LogSignals":
+        """Return the signals with noise of the known density added to every channel.
+
+        `scale` is the noise that the rows of sensors have shown over that density.
+        """
+        louder = dict.fromkeys(self.channels, 1.0)
+        for row, channels in {**SENSOR_PAIRS, **CELL_PAIRS}.items():
+            for channel in channels:
+                if channel in louder:
+                    louder[channel] = max(louder[channel], scale.get(row, 1.0))
+        rng = np.random.default_rng([NOISE_SEED, copy])
+        spectra = {}
+        for channel in self.channels:
+            density = louder[channel] * self.noise[channel] * math.sqrt(0.5 * self.grid.size)
+            parts = rng.standard_normal((2, density.size))
+            spectra[channel] = self.spectra[channel] + density * (parts[0] + 1j * parts[1])
+        return replace(self, spectra=spectra)
+
     def fuse_body(self, body: str) -> Spectrum:
         """Return the spectrum of the displacement of mass or table from both of its sensors."""
         channels = next(pair for name, *pair in BODY_SENSORS if name == body)
@@ -177,7 +246,7 @@ class LogSignals:
             # an offset would leak over the cuts at lost samples
             offset = residual.values[self.good].mean() if share < 1.0 else 0.0
             values = np.where(self.good, residual.values - offset, 0.0) / math.sqrt(share)
-            ratio = np.sqrt(compare_with_white(values, self.low_pass))
+            ratio = np.sqrt(compare_with_white(values, self.pass_of(residual.body)))
             ratio = np.minimum(ratio, MAX_NOISE_RATIO)
             noise |= {name: noise[name] * ratio for name in channels if name in noise}
         return replace(self, noise=noise)
@@ -223,6 +292,8 @@ class _SensorFusion:
     def __init__(self, signals: LogSignals) -> None:
         self.signals, self.noise = signals, signals.noise
         self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
+        # forces keep their steps, as those of a model have them; a second derivative cannot
+        self.read_pass = self.low_pass if derives_acc(signals.channels) else self.grid.low_pass
         self.kept_share = self.grid.white_noise_rms(self.low_pass)
         self.weights: dict[str, _ChannelWeights] = {}
         self.sensitivity: dict[str, float] = {}  # of the consistency residuals
@@ -234,7 +305,8 @@ class _SensorFusion:
         else:
             accelerometers = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
             densities = [self._weigh("mass against table", 1, "rel_disp_m", accelerometers)]
-        density = np.hypot.reduce(densities) * self.low_pass
+        self.density = np.hypot.reduce(densities)
+        density = self.density * self.low_pass
         # the surface noise is too slow for the low pass
         surface = math.sqrt(len(densities)) * signals.surface_noise_m
         rms = self._filtered_rms
@@ -358,14 +430,14 @@ class _SensorFusion:
             if weights.consistency is not None:
                 series[weights.body] = self.grid.to_time_domain(spectrum * weights.consistency)
         if channel not in ("rel_disp_m", "mass_disp_m"):
-            series["read"] = self.grid.to_time_domain(spectrum * self.low_pass)
+            series["read"] = self.grid.to_time_domain(spectrum * self.read_pass)
         return series
 
     def _filtered_rms(self, name: str) -> float:
         """Return the rms noise of a channel after the low pass, SI; NaN without the channel."""
         if name not in self.noise:
             return float("nan")
-        return self.grid.white_noise_rms(self.noise[name] * self.low_pass)
+        return self.grid.white_noise_rms(self.noise[name] * self.read_pass)
 
     def _side_noise(self, cells: tuple[str, ...]) -> float:
         """Return the rms noise of the force of a side in N; NaN without load cells."""
@@ -412,7 +484,7 @@ def build_signals(
         key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
     }
     rest_noise = {key: value for key, value in measured.items() if value is not None}
-    return LogSignals(
+    signals = LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
         grid.to_spectrum(np.ones(len(block))), remove_hum(spectra, grid, at_rest), noise,
         _measure_rest(columns, at_rest, noise),
@@ -422,6 +494,11 @@ def build_signals(
         usable[:: grid.decimation],
         rest_noise,
     )  # fmt: skip
+    band_hz = signals.find_force_band()
+    hz = grid.omega / (2.0 * np.pi)
+    roll_off = np.clip((hz / band_hz - 1.0) / (BAND_ROLL_OFF - 1.0), 0.0, 1.0)
+    low_pass = grid.low_pass * (0.5 + 0.5 * np.cos(np.pi * roll_off))
+    return replace(signals, low_pass=low_pass, band_hz=band_hz)
 
 
 def has_single_frequency(signals: LogSignals) -> bool:

@@ -74,14 +74,6 @@ class FrequencyGrid:
         """Return the spectrum, (frequency,), of values at the decimated rate, (sample,)."""
         return self.decimation * rfft(values, self.padded_size // self.decimation)
 
-    @property
-    def neighbour_correlation(self) -> float:
-        """Correlation of the noise of two adjacent samples at the decimated rate."""
-        power = self.low_pass**2
-        return float(
-            np.sum(power * np.cos(self.omega * self.decimation / self.rate_hz)) / power.sum()
-        )
-
     def white_noise_rms(self, gain: Float1D) -> float:
         """Return the rms of white noise of rms 1 (original rate) after a gain, (frequency,)."""
         return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))

@@ -155,7 +155,7 @@ def discover(
         discovery = discover_effects(prepared, start, report, without, mapper)
         if discovery.selection.complete:
             with contextlib.suppress(Cancelled):  # the discovery is kept
-                discovery, law = propose_law(discovery, report)
+                law = propose_law(discovery, report)
     if not ((law and law.is_sufficient) or is_explained(discovery) or is_available()):
         notes = (*notes, MISSING_MESSAGE)
     verdict = build_verdict(discovery, clock.now() - start_s, notes, judged, start, law)

@@ -116,7 +116,8 @@ class _DecidedPlant:
         """Return the discovery from recordings together, and a law for what it leaves open."""
         logs, _ = load_logs([self._log(name) for name in names])
         model = read_model_template(str(self._paths.case_dir / "model.toml"))[0]
-        return propose_law(discover_effects(logs, model))
+        discovery = discover_effects(logs, model)
+        return discovery, propose_law(discovery)
 
     def evaluate_tests(self, discovery: Discovery, law: LawProposal | None) -> Json:
         """Return the verdicts after the proposed and a random test; {"proposal": None} without."""

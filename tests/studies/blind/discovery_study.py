@@ -22,6 +22,7 @@ import numpy.typing as npt
 from table_io.clock import cpu_seconds
 from tests.studies.blind.cases import LaboratoryLevel, draw_case, list_case_numbers
 from tests.studies.blind.harness import Study, StudyOptions, format_error, run_study
+from tests.studies.blind.oracle import fit_known_effects
 from tests.studies.blind.page import (
     CONTROL_TITLES,
     CONTROLS_FILE,
@@ -38,7 +39,7 @@ from tests.studies.blind.scoring import (
     select_case_facts,
 )
 from twin.discovery.build_verdict import build_verdict
-from twin.discovery.discover import PreparedLog, discover_effects, fit_known_effects
+from twin.discovery.discover import PreparedLog, discover_effects
 from twin.discovery.signals import LogSignals
 from twin.discovery.task import identify
 from twin.model.model import Model

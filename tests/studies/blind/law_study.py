@@ -35,13 +35,10 @@ from tests.studies.blind.rivals import describe_missing, find_rivals, load_case
 from tests.studies.blind.scoring import select_case_facts
 from twin.discovery.discover import (
     PreparedProblem,
-    add_nuisances,
     prepare_problem,
-    sensors_disagree,
 )
-from twin.discovery.law_search import LawProposal, find_law, find_law_beside_nuisances
+from twin.discovery.law_search import LawProposal, find_law
 from twin.discovery.law_terms import LAW_PREFIX
-from twin.discovery.localization import estimate_repeatability_floor
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet, SelectionProblem
 from twin.model.inverse_dynamics import forces_along
@@ -134,7 +131,7 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
     row |= {"wall_s": clock.now() - start_s, "seconds": cpu_seconds() - start_cpu_s}
     best = law.fitted if law else null
     (residuals,) = problem.log_residuals
-    floor = problem.noise * estimate_repeatability_floor(problem.log_residuals, best.held_out)
+    floor = problem.noise
     row |= {
         "hidden": about["effects"],
         "law": _describe_terms(law),
@@ -163,20 +160,10 @@ def evaluate_proposed_law(root: Path, rig: str, has_rivals: bool, number: int) -
 def find_law_of_base(
     prepared: PreparedProblem,
 ) -> tuple[SelectionProblem, FittedSet, LawProposal | None]:
-    """Return (problem, its base, law) without a search of the library before.
-
-    With nuisances where sensors disagree and no law suffices with ideal ones.
-    """
+    """Return (problem, its base, law) without a search of the library before."""
     problem = prepared.problem
     null = problem.fit_effects(prepared.parameters, ())
-    law = find_law(problem, [null], problem.noise)
-    if (law is not None and law.is_sufficient) or not sensors_disagree(problem, null):
-        return problem, null, law
-    imperfect = add_nuisances(prepared, problem.least_weight**2 * null.cost)
-    own_null = imperfect.problem.fit_effects(imperfect.parameters, ())
-    floor = imperfect.problem.noise
-    imperfect, own_null, own = find_law_beside_nuisances(prepared, imperfect, [own_null], floor)
-    return (problem, null, law) if own is None else (imperfect.problem, own_null, own)
+    return problem, null, find_law(problem, [null], problem.noise)
 
 
 def _describe_terms(law: LawProposal | None) -> list[Json]:

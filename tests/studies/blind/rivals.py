@@ -27,7 +27,7 @@ effects with memory can be learned. It names no effect and gives an error floor.
 import math
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -39,6 +39,7 @@ from table_io.block import Bool2D, Float1D, Float2D, Int1D
 from twin.discovery.discover import PreparedLog, prepare_problem
 from twin.discovery.loading import load_logs
 from twin.discovery.motion import MeasuredMotion
+from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.screening import FOLD_COUNT, assign_folds
@@ -194,7 +195,8 @@ class RegressionProblem:
 def make_regression_problem(log: PreparedLog, model: Model) -> RegressionProblem:
     """Build the problem of a log, with the base model refitted; InputError as in discovery."""
     prepared = prepare_problem([log], model)
-    residuals = prepared.problem.log_residuals[0]
+    sampled = resolve_samples(prepared.problem.log_residuals[0], prepared.parameters)
+    residuals = replace(sampled, weight=1.0)
     assert residuals.whitening is None, "baselines use unwhitened residuals"
     assert residuals.rows[: len(FORCE_ROWS)] == FORCE_ROWS
     return RegressionProblem(residuals, prepared.parameters)

@@ -57,7 +57,7 @@ def test_a_case_in_which_a_study_was_interrupted_is_begun_anew(tmp_path: Path) -
     folder.mkdir(parents=True)
     for name in ("first.mcap", "proposed.mcap"):
         (folder / name).write_bytes(b"the beginning of a recording")
-    row = evaluate_decision(tmp_path, "one-frequency", number)
+    row = evaluate_decision(tmp_path, "sweep", number)
     assert row["first"]["named"] == ["coulomb_friction"]
     assert {path.name for path in folder.glob("*.mcap")} == {"first.mcap"}
 

@@ -1,0 +1,76 @@
+"""Evidence of sets of effects, in linear problems of known noise."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from table_io.block import Float2D
+from tests.discovery.played import SNM, log
+from twin.discovery.candidates import Candidate
+from twin.discovery.discover import prepare_problem
+from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence
+from twin.discovery.screening import Variant
+
+ENTRIES, FORCE = 400, 100.0
+
+
+@cache
+def list_laws() -> tuple[Candidate, ...]:
+    """Candidates of the library with one shape, which only lend their names."""
+    library = prepare_problem([log()], SNM).problem.library
+    return tuple(law for law in library if len(law.shapes) == 1)
+
+
+def build(columns: Float2D, residual: np.ndarray, noise: Float2D | None = None) -> LinearEvidence:
+    """Evidence of columns, (column, entry), measured with products `noise` in excess."""
+    count = len(columns)
+    variants = tuple(Variant(law, (), k, 0) for k, law in enumerate(list_laws()[:count]))
+    products = columns @ columns.T
+    true = products if noise is None else products - noise
+    scale = np.sqrt(np.diag(products))
+    return LinearEvidence(variants, {}, true, products, -columns @ residual, scale, FORCE, 1.0, 1.0)
+
+
+def draw(count: int, seed: int) -> Float2D:
+    return np.random.default_rng(seed).standard_normal((count, ENTRIES))
+
+
+def test_the_evidence_of_a_column_is_that_of_the_closed_form() -> None:
+    """r = -a x + e: r is normal with covariance 1 + x x' / p, p the precision of a."""
+    (x,), r = draw(1, 1), draw(1, 2)[0]
+    p = float(x @ x) / (EFFECT_SHARE * FORCE) ** 2
+    covariance = np.eye(ENTRIES) + np.outer(x, x) / p
+    _, logdet = np.linalg.slogdet(covariance)
+    expected = 0.5 * (r @ r - r @ np.linalg.solve(covariance, r)) - 0.5 * logdet
+    assert build(np.array([x]), r).measure_set([0]) == pytest.approx(expected)
+
+
+def test_a_planted_amplitude_is_found_within_its_deviation() -> None:
+    columns, noise = draw(3, 3), draw(1, 4)[0]
+    linear = build(columns, noise - 0.8 * columns[1])
+    best, *others = linear.rank_states(2)
+    assert best.columns == (1,)
+    without = [each.log_evidence for each in others if 1 not in each.columns]
+    assert best.log_evidence > max(without) + 10.0
+    (amplitude,), (deviation,) = linear.estimate(best.columns)
+    assert abs(amplitude - 0.8) < 3 * deviation
+    assert deviation == pytest.approx(1 / np.sqrt(ENTRIES), rel=0.1)
+
+
+def test_chance_is_named_no_more_often_than_stated() -> None:
+    """Of 200 recordings of noise, few give any set more evidence than none."""
+    columns = draw(8, 5)
+    more = sum(
+        build(columns, draw(1, 100 + seed)[0]).rank_states(2)[0].columns != ()
+        for seed in range(200)
+    )
+    assert more <= 4
+
+
+def test_a_column_that_is_noise_explains_nothing() -> None:
+    """Its products with a residual of the same noise are large: on average by what is taken off."""
+    noise = draw(1, 6)[0]
+    column = np.array([noise])
+    linear = build(column, -0.5 * noise, noise=np.array([[noise @ noise * (1 - 1e-6)]]))
+    assert linear.measure_set([0]) < 1.0

@@ -1,0 +1,429 @@
+"""Evidence of sets of effects: one linear Gaussian model of what a fitted model leaves.
+
+About a fit the residual r is linear in the parameters of the base and the nuisances A, in the
+amplitudes of every candidate B, and in a smooth unknown force T by place, the stranger, which
+always competes. With Gaussian priors of the amplitudes the evidence of a set S is
+
+    log E = 1/2 g (I + P)^-1 g - 1/2 log det(1 + P^-1 I),   I = S C^-1 S,   g = S C^-1 h,
+
+S the products of its columns and h those with the residual, both after A has been absorbed, C the
+covariance of h, P the precisions of the priors. The measured motion is noisy: what its noise adds
+to S and h on average, from copies of the noise, is taken off, but it stays in C. Residuals that are
+correlated, or louder than expected, count less: C is multiplied by their variance inflation, from
+the scatter of the scores between units (steps) in the richest model.
+
+MacKay, Information Theory, Inference, and Learning Algorithms, 2003, chapter 28; for errors in the
+regressors Fuller, Measurement Error Models, 1987; for the inflation Kent, Biometrika 69, 1982.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import product
+
+import numpy as np
+
+from table_io.block import Float1D, Float2D, Int1D
+from twin.discovery.candidates import Candidate
+from twin.discovery.least_squares import INTERVAL_SIGMA, MapFunction, compute_slopes
+from twin.discovery.parameters import FreeParameter, ParameterSet
+from twin.discovery.residuals import LogResiduals
+from twin.discovery.screening import Variant, assign_units
+from twin.discovery.strangers import compute_stranger_forces
+
+EFFECT_SHARE = 0.1  # standard deviation of an effect's force over that of the record, before a test
+STRANGER_SHARES = (0.003, 0.01, 0.03, 0.1)  # the same for the stranger, each as likely
+# Probabilities before a test: of no effect, one, two and three, and of a stranger beside them.
+SET_PRIORS = (0.5, 0.3, 0.15, 0.05)
+STRANGER_PRIOR = 0.2
+PAIR_STARTS, TRIPLE_STARTS, STRANGER_STARTS = 40, 12, 12  # sets that are extended
+NOISE_COPIES = 1  # of the noise, whose mean products are taken off
+MIN_BASE_SHARE = 1e-12  # of the curvature of the base: directions with less are left out
+MIN_INFORMATION_SHARE = 1e-9  # of a column's norm: with less left, other parameters imitate it
+
+
+@dataclass(frozen=True, slots=True)
+class Hypothesis:
+    """Explanation: variants of candidates, by column, and the place of a stranger or ""."""
+
+    columns: tuple[int, ...]
+    place: str
+    log_evidence: float
+
+
+@dataclass(frozen=True, eq=False)
+class LinearEvidence:
+    """Linear model about a fit: products after the base has been absorbed.
+
+    `products` (column, column) and `scores` (column,) of candidates and stranger, over the noise,
+    and the `covariance` of the scores; `scale` are the norms of the columns as they are.
+    """
+
+    variants: tuple[Variant, ...]
+    places: Mapping[str, Int1D]  # columns of the stranger by place
+    products: Float2D
+    covariance: Float2D
+    scores: Float1D
+    scale: Float1D  # norm of each column before the base was absorbed
+    force: float  # norm of the measured forces
+    inflation: float  # of the covariance of the scores, which holds it
+    level: float  # mean square over the noise that the richest model leaves
+
+    @cached_property
+    def _precision(self) -> Float1D:
+        """Precision of the prior of each column, (column,)."""
+        return (self.scale / (EFFECT_SHARE * self.force)) ** 2
+
+    def measure_set(self, columns: Sequence[int], place: str = "") -> float:
+        """Return the log evidence of a set and a stranger against none, without prior odds."""
+        chosen = [*columns]
+        if not place:
+            return self._measure(chosen, self._precision[chosen])
+        extra = self.places[place]
+        both = [*chosen, *extra.tolist()]
+        evidences = [
+            self._measure(
+                both,
+                np.concatenate(
+                    [
+                        self._precision[chosen],
+                        self._precision[extra] * (EFFECT_SHARE / share) ** 2,
+                    ]
+                ),
+            )
+            for share in STRANGER_SHARES
+        ]
+        return float(np.logaddexp.reduce(evidences)) - math.log(len(evidences))
+
+    def _inform(self, sets: Int1D) -> tuple[Float2D, Float2D]:
+        """Return (information I (set, column, column), g (set, column)) of sets of columns."""
+        rows, columns = sets[:, :, None], sets[:, None, :]
+        s, c, h = self.products[rows, columns], self.covariance[rows, columns], self.scores[sets]
+        solved = np.linalg.solve(c, np.concatenate([s, h[:, :, None]], axis=2))
+        return s @ solved[:, :, :-1], (s @ solved[:, :, -1:])[:, :, 0]
+
+    def _measure(self, columns: Sequence[int], precision: Float1D) -> float:
+        if not columns:
+            return 0.0
+        (information,), (g,) = self._inform(np.array([columns]))
+        size = np.sqrt(precision)
+        matrix = information / np.outer(size, size) + np.eye(len(columns))
+        factor = np.linalg.cholesky(matrix)
+        solved = np.linalg.solve(factor, g / size)
+        return 0.5 * float(solved @ solved) - float(np.log(np.diag(factor)).sum())
+
+    def estimate(self, columns: Sequence[int]) -> tuple[Float1D, Float1D]:
+        """Return (amplitudes, their standard deviations) of a set, (column,) each."""
+        (information,), (g,) = self._inform(np.array([columns]))
+        covariance = np.linalg.inv(information + np.diag(self._precision[[*columns]]))
+        return covariance @ g, np.sqrt(np.diag(covariance))
+
+    def find_column(self, candidate: Candidate, shape: tuple[float, ...]) -> int | None:
+        """Return the column of a candidate with a shape, or the nearest that is known."""
+        own = [k for k, v in enumerate(self.variants) if v.candidate.name == candidate.name]
+        exact = [k for k in own if self.variants[k].shape == shape]
+        return next(iter(exact or own), None)
+
+    def bound_amplitude(self, column: int, beside: Sequence[int]) -> tuple[float, float]:
+        """Return (end of the 95 % interval of an amplitude, its force over that of the record).
+
+        Beside the columns of other effects, and with no prior: what the recordings alone say.
+        """
+        chosen = [column, *(k for k in beside if k != column)]
+        (information,), (g,) = self._inform(np.array([chosen]))
+        size = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        covariance = np.linalg.pinv(information / np.outer(size, size), hermitian=True)
+        covariance /= np.outer(size, size)
+        amplitude = float(covariance[0] @ g)
+        end = abs(amplitude) + INTERVAL_SIGMA * math.sqrt(max(float(covariance[0, 0]), 0.0))
+        return end, end * float(self.scale[column]) / self.force
+
+    def names(self, state: Hypothesis) -> frozenset[str]:
+        """Return the names of the effects of a state."""
+        return frozenset(self.variants[c].candidate.name for c in state.columns)
+
+    def log_prior(self, size: int, with_stranger: bool) -> float:
+        """Return the log of the prior odds of a set of so many effects, against none."""
+        count = len({variant.candidate.name for variant in self.variants})
+        sets = math.log(max(math.comb(count, size), 1)) if size else 0.0
+        odds = math.log(SET_PRIORS[min(size, len(SET_PRIORS) - 1)] / SET_PRIORS[0]) - sets
+        if with_stranger:
+            odds += math.log(STRANGER_PRIOR / (1 - STRANGER_PRIOR) / max(len(self.places), 1))
+        return odds
+
+    def rank_states(self, max_effects: int) -> list[Hypothesis]:
+        """Return the explanations, the most probable first: sets, with and without a stranger."""
+        columns = [k for k, _ in enumerate(self.variants) if self.scale[k] > 0]
+        states = [Hypothesis((), "", 0.0)]
+        layer = self._rank([(c,) for c in columns])
+        states += layer
+        for size, starts in ((2, PAIR_STARTS), (3, TRIPLE_STARTS)):
+            if size > max_effects:
+                break
+            layer = self._rank(
+                sorted(
+                    {
+                        tuple(sorted((*state.columns, c)))
+                        for state in self._distinct(layer)[:starts]
+                        for c in columns
+                        if self.variants[c].candidate.name not in self.names(state)
+                        and self._is_separate(state.columns, c)
+                    }
+                )
+            )
+            states += layer
+        states = self._distinct(sorted(states, key=lambda state: -state.log_evidence))
+        with_stranger = [
+            Hypothesis(
+                state.columns, place,
+                self.measure_set(state.columns, place)
+                - self._shape_count(state.columns)
+                + self.log_prior(len(state.columns), True),
+            )
+            for state in states[:STRANGER_STARTS]
+            for place in self.places
+        ]  # fmt: skip
+        return sorted((*states, *with_stranger), key=lambda state: -state.log_evidence)
+
+    def _is_separate(self, columns: Sequence[int], column: int) -> bool:
+        """Return True if the candidates share no parameter."""
+        own = {free.key for free in self.variants[column].candidate.free}
+        return all(
+            own.isdisjoint(free.key for free in self.variants[c].candidate.free) for c in columns
+        )
+
+    def _shape_count(self, columns: Sequence[int]) -> float:
+        return sum(math.log(len(self.variants[c].candidate.shapes)) for c in columns)
+
+    def _rank(self, sets: Sequence[tuple[int, ...]]) -> list[Hypothesis]:
+        if not sets:
+            return []
+        table = np.array(sets)
+        size = np.sqrt(self._precision[table])
+        s, h = self._inform(table)
+        s /= size[:, :, None] * size[:, None, :]
+        s += np.eye(table.shape[1])
+        h /= size
+        solved = np.linalg.solve(s, h[:, :, None])[:, :, 0]
+        _, determinant = np.linalg.slogdet(s)
+        evidence = 0.5 * np.einsum("ni,ni->n", h, solved) - 0.5 * determinant
+        signs = np.array([variant.sign for variant in self.variants])[table]
+        deviations = np.sqrt(np.maximum(np.einsum("nii->ni", np.linalg.inv(s)), 0.0))
+        allowed = (signs * solved >= -deviations).all(axis=1)
+        prior = self.log_prior(table.shape[1], False)
+        order = np.argsort(-evidence)
+        return [
+            Hypothesis(tuple(table[k].tolist()), "", float(evidence[k])
+                  - self._shape_count(table[k].tolist()) + prior)
+            for k in order
+            if allowed[k]
+        ]  # fmt: skip
+
+    def _distinct(self, states: Sequence[Hypothesis]) -> list[Hypothesis]:
+        """Return the best state of each set of names and place, in the same order."""
+        best: dict[tuple[frozenset[str], str], Hypothesis] = {}
+        for state in states:
+            best.setdefault((self.names(state), state.place), state)
+        return [*best.values()]
+
+
+def build_evidence(
+    log_residuals: Sequence[LogResiduals],
+    parameters: ParameterSet,
+    library: Sequence[Candidate],
+    known_shapes: Mapping[str, tuple[float, ...]],
+    rich: Sequence[tuple[str, tuple[float, ...]]] = (),
+    mapper: MapFunction = map,
+) -> LinearEvidence:
+    """Build the linear model about a parameter set; parameters at a bound are held there."""
+    free = [p for p in parameters.free if p.low < parameters.values[p.keys[0]] < p.high]
+    variants: list[Variant] = []
+    requests: list[tuple[ParameterSet, FreeParameter, float]] = [(parameters, p, 0.0) for p in free]
+    for candidate in library:
+        amplitude, vanishing = candidate.amplitude, candidate.vanishing
+        sign = int(amplitude.low >= vanishing) - int(amplitude.high <= vanishing)
+        known = known_shapes.get(candidate.name)
+        shapes = dict.fromkeys((*candidate.shapes, *([known] if known else [])))
+        for shape, probe in product(shapes, candidate.probes):
+            variants.append(Variant(candidate, shape, len(variants), sign))
+            requests.append((candidate.add_to(parameters, shape), amplitude, probe))
+
+    columns, places = _fill_columns(log_residuals, parameters, requests, len(variants), mapper)
+    noise = np.zeros((len(columns), len(columns)))
+    for copy in range(NOISE_COPIES):
+        copies = [residuals.with_noise_copy(copy) for residuals in log_residuals]
+        noisy, _ = _fill_columns(copies, parameters, requests, len(variants), mapper)
+        noisy -= columns
+        noise += noisy @ noisy.T / NOISE_COPIES
+    unit = _number_units(log_residuals)
+    rich_columns = [
+        k for k, variant in enumerate(variants) if (variant.candidate.name, variant.shape) in rich
+    ]
+    return _absorb_base(
+        columns, noise, len(free), unit, tuple(variants), places, _measure_force(log_residuals),
+        rich_columns, float(np.mean([r.expected_square for r in log_residuals])),
+    )  # fmt: skip
+
+
+def _fill_columns(
+    log_residuals: Sequence[LogResiduals],
+    parameters: ParameterSet,
+    requests: Sequence[tuple[ParameterSet, FreeParameter, float]],
+    variant_count: int,
+    mapper: MapFunction,
+) -> tuple[Float2D, dict[str, Int1D]]:
+    """Return (slopes of the requests, columns of the stranger, residual; (column, entry), places).
+
+    The columns of the nuisances have no noise, and are the same in a copy with more of it.
+    """
+    before = [residuals.evaluate(parameters) for residuals in log_residuals]
+
+    def slopes(request: tuple[ParameterSet, FreeParameter, float]) -> Float1D:
+        start, parameter, probe = request
+        with np.errstate(all="ignore"):
+            column = np.concatenate(compute_slopes(log_residuals, start, parameter, before, probe))
+        return column if np.isfinite(column).all() else np.zeros(column.size)
+
+    rows = [*mapper(slopes, requests)]
+    places, strangers = _list_strangers(log_residuals, parameters, variant_count)
+    return np.array([*rows, *strangers, np.concatenate(before)]), places
+
+
+def _list_strangers(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet, first: int
+) -> tuple[dict[str, Int1D], list[Float1D]]:
+    """Return (columns by place, counted from `first`; the columns) of the stranger."""
+    entries: dict[str, list[list[Float1D]]] = {}
+    by_log = [compute_stranger_forces(residuals, parameters) for residuals in log_residuals]
+    common = [place for place in by_log[0] if all(place in forces for forces in by_log)]
+    for place in common:
+        entries[place] = [
+            [
+                residuals.enter_forces(force)
+                for residuals, force in zip(log_residuals, of_logs, strict=True)
+            ]
+            for of_logs in zip(*(forces[place] for forces in by_log), strict=True)
+        ]
+    columns: list[Float1D] = []
+    places: dict[str, Int1D] = {}
+    for place, parts in entries.items():
+        own = [np.concatenate(part) for part in parts]
+        own = [column for column in own if column @ column > 0]
+        if own:
+            places[place] = first + len(columns) + np.arange(len(own))
+            columns += own
+    return places, columns
+
+
+def _number_units(log_residuals: Sequence[LogResiduals]) -> Int1D:
+    """Return the unit of each entry of all logs, (entry,): steps, or blocks outside steps."""
+    parts, first = [], 0
+    for residuals in log_residuals:
+        unit = assign_units(residuals)
+        parts.append(first + unit)
+        first += int(unit.max()) + 1
+    return np.concatenate(parts)
+
+
+def _measure_force(log_residuals: Sequence[LogResiduals]) -> float:
+    """Return the norm of the measured forces over the noise."""
+    squares = sum(float(np.sum(residuals.measured_entries**2)) for residuals in log_residuals)
+    return math.sqrt(max(squares, 1e-300))
+
+
+def _absorb_base(
+    columns: Float2D, noise: Float2D, base: int, unit: Int1D, variants: tuple[Variant, ...],
+    places: dict[str, Int1D], force: float, rich: Sequence[int], expected: float,
+) -> LinearEvidence:  # fmt: skip
+    """Return the linear model; `columns` are those of base, candidates, stranger, and the residual.
+
+    `noise` are the products of the noise in the columns, which the measured products contain too:
+    a column that is left with noise alone would explain the noise of the residual.
+    """
+    scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
+    scale[-1] = 1.0
+    columns = columns / np.maximum(scale, 1e-300)[:, None]
+    noise = noise / np.maximum(np.outer(scale, scale), 1e-300)
+    gram = columns @ columns.T - noise
+    u, s, _ = np.linalg.svd(gram[:base, :base], hermitian=True)
+    kept = s > MIN_BASE_SHARE * max(float(s.max(initial=0.0)), 1e-300)
+    inverse = (u[:, kept] / s[kept]) @ u[:, kept].T
+    absorbed = inverse @ gram[:base, base:]
+    reduced = gram[base:, base:] - gram[base:, :base] @ absorbed
+    rest = columns[base:] - absorbed.T @ columns[:base]
+    own_scale, count = scale[base:-1], len(variants)
+    products = reduced[:-1, :-1] * np.outer(own_scale, own_scale)
+    scores = -reduced[:-1, -1] * own_scale
+    # columns that are noise, or that the base imitates, have nothing left
+    is_left = np.diag(reduced)[:-1] > MIN_INFORMATION_SHARE
+    products[~is_left], products[:, ~is_left], scores[~is_left] = 0.0, 0.0, 0.0
+    inflation, level = _measure_inflation(
+        rest[:-1] * is_left[:, None], rest[-1], unit, count, rich, expected
+    )
+    usable = np.where(is_left, own_scale, 0.0)
+    own = rest[:-1] * np.where(is_left, own_scale, 0.0)[:, None]
+    chance = _absorb(noise, absorbed, base)[:-1, :-1] / NOISE_COPIES
+    chance *= np.outer(own_scale, own_scale)
+    covariance = inflation * (own @ own.T + np.where(np.outer(is_left, is_left), chance, 0.0))
+    covariance += np.diag(np.where(is_left, MIN_INFORMATION_SHARE * own_scale**2, 1.0))
+    places = {
+        place: columns_of[is_left[columns_of]]
+        for place, columns_of in places.items()
+        if is_left[columns_of].any()
+    }
+    return LinearEvidence(
+        variants, places, _make_positive(products), covariance, scores, usable, force, inflation,
+        level,
+    )  # fmt: skip
+
+
+def _absorb(products: Float2D, absorbed: Float2D, base: int) -> Float2D:
+    """Return the products of columns, less those of the base that they contain."""
+    mixed = absorbed.T @ products[:base, base:]
+    return products[base:, base:] - mixed - mixed.T + absorbed.T @ products[:base, :base] @ absorbed
+
+
+def _make_positive(products: Float2D) -> Float2D:
+    """Return the nearest products without negative curvature, which chance may leave."""
+    size = np.sqrt(np.maximum(np.diag(products), 1e-300))
+    values, vectors = np.linalg.eigh(products / np.outer(size, size))
+    positive = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return positive * np.outer(size, size)
+
+
+def _measure_inflation(
+    rest: Float2D, r: Float1D, unit: Int1D, count: int, rich: Sequence[int], expected: float
+) -> tuple[float, float]:
+    """Return (variance inflation of scores, mean square) of what the richest model leaves.
+
+    That model has the stranger at every place, the columns `rich`, and the column itself: what is
+    left scatters between the units (steps) more than its samples say where these are correlated.
+    """
+    chosen = rest[[*rich, *range(count, len(rest))]]
+    chosen = chosen[np.einsum("ij,ij->i", chosen, chosen) > MIN_INFORMATION_SHARE]
+    left = r
+    if len(chosen):
+        solution = np.linalg.lstsq(chosen @ chosen.T, chosen @ r, rcond=1e-8)[0]
+        left = r - solution @ chosen
+    level = float(left @ left) / max(r.size, 1)
+    ratios = []
+    units = int(unit.max(initial=0)) + 1
+    for column in rest[:count]:
+        square = column**2
+        if not square.any():
+            continue
+        own = np.bincount(unit, weights=square, minlength=units)
+        sums = np.bincount(unit, weights=column * left, minlength=units)
+        sums -= own * sums.sum() / own.sum()
+        effective = own.sum() ** 2 / (own @ own)
+        scatter = float(sums @ sums) * effective / max(effective - 1.0, 1.0)
+        ratios.append(scatter / max(float(square @ left**2), 1e-300))
+    correlated = float(np.median(ratios)) if ratios else 1.0
+    return max(1.0, correlated) * max(1.0, level / expected), level
+
+
+def softmax(states: Sequence[Hypothesis]) -> Float1D:
+    """Return the probability of each state, (state,)."""
+    logs = np.array([state.log_evidence for state in states])
+    return np.exp(logs - np.logaddexp.reduce(logs))
