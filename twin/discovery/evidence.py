@@ -139,6 +139,11 @@ class LinearEvidence:
         end = abs(amplitude) + INTERVAL_SIGMA * math.sqrt(max(float(covariance[0, 0]), 0.0))
         return end, end * float(self.scale[column]) / self.force
 
+    def measure_gain(self, columns: Sequence[int]) -> float:
+        """Return the residual squares, over the inflation, that a set removes at its maximum."""
+        (information,), (g,) = self._inform(np.array([columns]))
+        return float(g @ np.linalg.lstsq(information, g, rcond=1e-12)[0])
+
     def names(self, state: Hypothesis) -> frozenset[str]:
         """Return the names of the effects of a state."""
         return frozenset(self.variants[c].candidate.name for c in state.columns)

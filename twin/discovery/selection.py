@@ -31,7 +31,6 @@ MAX_EXPLAINED_COST = 1.1  # mean square over the noise: with less, nothing is le
 MAX_ROUNDS = 3  # of rankings, each about the best fit of the one before
 REFIT_NATS, MAX_REFITS = 5.0, 4  # below the best log evidence; sets refitted in a round
 MAX_GENERIC_REFITS = 2
-MIN_AMPLITUDE_SHARE = 1e-9  # of the scale of an amplitude: with less an effect is none
 MIN_PROBABILITY = 1e-3  # of an explanation that is reported
 MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
 MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
@@ -71,16 +70,6 @@ class FittedSet:
     def cost(self) -> float:
         """Mean square of the cross-validation residual over the noise."""
         return mean_square(self.held_out)
-
-    @property
-    def has_vanished(self) -> bool:
-        """True if an effect is of no size: not one of the set, whatever promised it."""
-        values = self.fit.parameters.values
-        return any(
-            abs(values[effect.amplitude.key] - effect.vanishing)
-            < MIN_AMPLITUDE_SHARE * effect.amplitude.scale
-            for effect in self.effects
-        )
 
     def add_to(self, parameters: ParameterSet) -> ParameterSet:
         """Add the effects, free, to a parameter set at their fitted values."""
@@ -276,9 +265,9 @@ def _advance(
     linear = build_evidence(
         problem.log_residuals, base, problem.library, known_shapes, rich, problem.mapper
     )
-    states = linear.rank_states(MAX_EFFECTS)
+    promised = linear.rank_states(MAX_EFFECTS)
     for index in range(1, MAX_REFITS + 1):
-        states = _drop_refuted(linear, states, refitted)
+        states = _correct_by_refits(linear, promised, refitted, state.null)
         each = _find_open(linear, states, refitted)
         if each is None:
             break
@@ -290,7 +279,7 @@ def _advance(
             parameters = variant.add_to(parameters, float(amplitude))
         effects = tuple(variant.candidate for variant in variants)
         refitted[frozenset(names)] = problem.fit_effects(parameters, effects)
-    states = _drop_refuted(linear, states, refitted)
+    states = _correct_by_refits(linear, promised, refitted, state.null)
     best = next(refitted[linear.names(each)] for each in states if linear.names(each) in refitted)
     explanations = tuple(
         Explanation(tuple(sorted(linear.names(each))), each.place, float(p))
@@ -319,14 +308,34 @@ def _find_open(
     return None
 
 
-def _drop_refuted(
+def _correct_by_refits(
     linear: LinearEvidence,
     states: Sequence[Hypothesis],
     refitted: Mapping[frozenset[str], FittedSet],
+    null: FittedSet,
 ) -> list[Hypothesis]:
-    """Return the states without the sets of which an effect vanishes when they are refitted."""
-    refuted = [names for names, fitted in refitted.items() if fitted.has_vanished]
-    return [each for each in states if not any(names <= linear.names(each) for names in refuted)]
+    """Return the states, the most probable first, less what a refit has not kept of its promise.
+
+    What the linear model promises of a set, its refit may not find: an effect vanishes, or removes
+    less. The set then counts by what was found, and so does each larger one that was not refitted.
+    """
+    count = sum(values.size for values in null.held_out)
+    lost: dict[frozenset[str], float] = {}
+    for state in states:
+        names = linear.names(state)
+        if state.columns and names in refitted and names not in lost:
+            promised = linear.measure_gain(state.columns)
+            kept = (null.fit.cost - refitted[names].fit.cost) * count / linear.inflation
+            lost[names] = 0.5 * promised * min(max(1.0 - kept / max(promised, 1e-300), 0.0), 1.0)
+
+    def correct(state: Hypothesis) -> Hypothesis:
+        names = linear.names(state)
+        own = lost.get(names)
+        if own is None:
+            own = max((loss for smaller, loss in lost.items() if smaller <= names), default=0.0)
+        return replace(state, log_evidence=state.log_evidence - own)
+
+    return sorted(map(correct, states), key=lambda state: -state.log_evidence)
 
 
 def fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
