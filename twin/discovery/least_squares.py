@@ -286,8 +286,11 @@ class _LevenbergMarquardt:
             block_gradients = np.array(
                 [np.bincount(blocks, weights=row[moving] * r[moving]) for row in jacobian]
             )
-            # a rest row has a single entry: its variance is taken from the noise
+            # A rest row has a single entry: its variance is that of the noise, of a prior 1.
             rest_slopes = jacobian[:, moving.stop : last] / residuals.weight
+            priors = residuals.prior_count
+            if priors:
+                rest_slopes[:, -priors:] *= residuals.weight
             information.append(
                 [np.bincount(blocks, row[moving] ** 2).astype(np.float64) for row in jacobian]
             )
