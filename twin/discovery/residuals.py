@@ -345,8 +345,12 @@ class LogResiduals:
     @property
     def _rest_entry_count(self) -> int:
         """Number of residual entries in the rest row."""
-        priors = len(self.nuisances.keys) if self.nuisances is not None else 0
-        return len(self.rest_channels) + len(self.signals.zero_channels) + priors
+        return len(self.rest_channels) + len(self.signals.zero_channels) + self.prior_count
+
+    @property
+    def prior_count(self) -> int:
+        """Number of priors of nuisances, the last entries."""
+        return len(self.nuisances.keys) if self.nuisances is not None else 0
 
     @cached_property
     def entry_sample(self) -> Int1D:
@@ -633,7 +637,6 @@ class LogResiduals:
             (FORM_ERROR_SHARE, (laws[self.entry_row < len(self.rows)]) ** 2),
         )
         parts = [(share**2 * float(of.sum()), learned._count_different(of)) for share, of in errors]
-        unknown = sum(part for part, _ in parts)
         weight = math.sqrt(1.0 + sum(part / count for part, count in parts))
         terms = self.nuisances
         if terms is not None:
@@ -644,7 +647,8 @@ class LogResiduals:
                 ]
             )
             terms = replace(terms, columns=(terms.columns / ratio).astype(np.float32))
-        expected = (1.0 + unknown / max(squares.size, 1)) / weight**2
+        # a name must leave no more than instruments do, whatever form its law has
+        expected = (1.0 + parts[0][0] / max(squares.size, 1)) / weight**2
         return replace(learned, weight=weight, expected_square=expected, nuisances=terms)
 
     def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
