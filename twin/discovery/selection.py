@@ -145,6 +145,14 @@ class SelectionProblem:
         """Cross-validation fold of each entry, (entry,) per log."""
         return tuple(assign_folds(residuals) for residuals in self.log_residuals)
 
+    def measure_level(self, fitted: FittedSet) -> float:
+        """Return the mean square of the residual in motion: at rest no force of a model acts."""
+        rows = [
+            held_out[residuals.entry_row < len(residuals.rows)]
+            for held_out, residuals in zip(fitted.held_out, self.log_residuals, strict=True)
+        ]
+        return mean_square(rows)
+
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""
         rows: dict[str, list[Float1D]] = {}

@@ -69,7 +69,7 @@ def judge_selection(
     by_set = sum_by_set(selection.explanations)
     probability = by_set.get(frozenset(best.names), 0.0)
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
-    remains = best.cost > MAX_LEVEL * max(problem.expected_square, floor)
+    remains = problem.measure_level(best) > MAX_LEVEL * max(problem.expected_square, floor)
     has_remainder = beside > 0.5 or remains
     generic = None
     if has_remainder:
