@@ -95,7 +95,8 @@ def judge_selection(
     if has_remainder:
         # a name needs an absolute fit: what it leaves must be noise
         names = " + ".join(best.names)
-        reason = f"{names} leave a part of the misfit that is no noise, an unknown force{where}"
+        verb = "leaves" if len(best.names) == 1 else "leave"
+        reason = f"{names} {verb} a part of the misfit that is no noise, an unknown force{where}"
         certainty = 0.0 if remains else probability * (1.0 - beside)
         return conclude("unexplained", best, certainty, reason)
     limits = {c.name: c.effect.limits for c in problem.library if c.effect is not None}
