@@ -1,6 +1,5 @@
 """Discovery of missing effects: from the signals of logs and a model to a verdict."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -82,12 +81,6 @@ class PreparedProblem:
     @property
     def parameters(self) -> ParameterSet:
         return self.first_fit.parameters
-
-    @property
-    def base_cost(self) -> float:
-        """Mean square over the noise that the base leaves, with ideal instruments."""
-        # where model error limits the fit, the residual is divided by it
-        return self.problem.least_weight**2 * self.first_fit.cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,10 +264,6 @@ def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
                 f"{parameter.name}: each gap differs by {1e3 * value:+.2f} mm from the stated one"
             )
     return notes
-
-
-def _rms(residual: Float1D) -> float:
-    return math.sqrt(float(residual @ residual) / max(residual.size, 1))
 
 
 def discover_effects(

@@ -28,7 +28,7 @@ from table_io.block import Float1D, Float2D, Int1D
 from twin.discovery.candidates import Candidate
 from twin.discovery.least_squares import INTERVAL_SIGMA, MapFunction, compute_slopes
 from twin.discovery.parameters import FreeParameter, ParameterSet
-from twin.discovery.residuals import LogResiduals
+from twin.discovery.residuals import LogResiduals, expected_level
 from twin.discovery.screening import Variant, assign_units
 from twin.discovery.strangers import compute_stranger_forces
 
@@ -103,21 +103,29 @@ class LinearEvidence:
         solved = np.linalg.solve(c, np.concatenate([s, h[:, :, None]], axis=2))
         return s @ solved[:, :, :-1], (s @ solved[:, :, -1:])[:, :, 0]
 
+    def _weigh(self, sets: Int1D, precision: Float2D) -> tuple[Float1D, Float2D, Float2D]:
+        """Return (log evidence, amplitudes, standard deviations) of sets with their priors."""
+        size = np.sqrt(precision)
+        information, g = self._inform(sets)
+        information /= size[:, :, None] * size[:, None, :]
+        information += np.eye(sets.shape[1])
+        g /= size
+        solved = np.linalg.solve(information, g[:, :, None])[:, :, 0]
+        _, determinant = np.linalg.slogdet(information)
+        evidence = 0.5 * np.einsum("ni,ni->n", g, solved) - 0.5 * determinant
+        variances = np.einsum("nii->ni", np.linalg.inv(information))
+        return evidence, solved / size, np.sqrt(np.maximum(variances, 0.0)) / size
+
     def _measure(self, columns: Sequence[int], precision: Float1D) -> float:
         if not columns:
             return 0.0
-        (information,), (g,) = self._inform(np.array([columns]))
-        size = np.sqrt(precision)
-        matrix = information / np.outer(size, size) + np.eye(len(columns))
-        factor = np.linalg.cholesky(matrix)
-        solved = np.linalg.solve(factor, g / size)
-        return 0.5 * float(solved @ solved) - float(np.log(np.diag(factor)).sum())
+        return float(self._weigh(np.array([columns]), precision[None, :])[0][0])
 
     def estimate(self, columns: Sequence[int]) -> tuple[Float1D, Float1D]:
         """Return (amplitudes, their standard deviations) of a set, (column,) each."""
-        (information,), (g,) = self._inform(np.array([columns]))
-        covariance = np.linalg.inv(information + np.diag(self._precision[[*columns]]))
-        return covariance @ g, np.sqrt(np.diag(covariance))
+        sets = np.array([columns])
+        _, (amplitudes,), (deviations,) = self._weigh(sets, self._precision[sets])
+        return amplitudes, deviations
 
     def find_column(self, candidate: Candidate, shape: tuple[float, ...]) -> int | None:
         """Return the column of a candidate with a shape, or the nearest that is known."""
@@ -205,17 +213,9 @@ class LinearEvidence:
         if not sets:
             return []
         table = np.array(sets)
-        size = np.sqrt(self._precision[table])
-        s, h = self._inform(table)
-        s /= size[:, :, None] * size[:, None, :]
-        s += np.eye(table.shape[1])
-        h /= size
-        solved = np.linalg.solve(s, h[:, :, None])[:, :, 0]
-        _, determinant = np.linalg.slogdet(s)
-        evidence = 0.5 * np.einsum("ni,ni->n", h, solved) - 0.5 * determinant
+        evidence, amplitudes, deviations = self._weigh(table, self._precision[table])
         signs = np.array([variant.sign for variant in self.variants])[table]
-        deviations = np.sqrt(np.maximum(np.einsum("nii->ni", np.linalg.inv(s)), 0.0))
-        allowed = (signs * solved >= -deviations).all(axis=1)
+        allowed = (signs * amplitudes >= -deviations).all(axis=1)
         prior = self.log_prior(table.shape[1], False)
         order = np.argsort(-evidence)
         return [
@@ -267,7 +267,7 @@ def build_evidence(
     ]
     return _absorb_base(
         columns, noise, len(free), unit, tuple(variants), places, _measure_force(log_residuals),
-        rich_columns, float(np.mean([r.expected_square for r in log_residuals])),
+        rich_columns, expected_level(log_residuals),
     )  # fmt: skip
 
 

@@ -91,16 +91,16 @@ class DiscoveryView:
 
     def _list_samples(self, fitted: FittedSet) -> tuple[LogResiduals, ...]:
         """Return the residuals at the samples, less the instrument errors fitted with a set."""
-        known = self._sample_cache.get(id(fitted))
+        known = self._sample_cache.get(fitted)
         if known is None:
             parameters = fitted.fit.parameters
             problem = self.discovery.prepared.problem
             known = tuple(resolve_samples(each, parameters) for each in problem.log_residuals)
-            self._sample_cache[id(fitted)] = known
+            self._sample_cache[fitted] = known
         return known
 
     @cached_property
-    def _sample_cache(self) -> dict[int, tuple[LogResiduals, ...]]:
+    def _sample_cache(self) -> dict[FittedSet, tuple[LogResiduals, ...]]:
         return {}
 
     @property

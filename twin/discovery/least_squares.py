@@ -16,7 +16,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     get_log,
 )
-from twin.discovery.residuals import MAX_LEVEL, LogResiduals
+from twin.discovery.residuals import MAX_LEVEL, LogResiduals, expected_level
 
 MAX_ITERATIONS = 40
 MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
@@ -102,9 +102,7 @@ def fit_with_misfit(
     cross-validation residual of the result are over the noise alone nevertheless.
     """
     fit = fit_parameters(log_residuals, start, folds=folds, mapper=mapper)
-    expected = sum(r.expected_square * r.entry_row.size for r in log_residuals)
-    count = sum(r.entry_row.size for r in log_residuals)
-    if not fit.free or fit.cost * count <= MAX_LEVEL * expected:
+    if not fit.free or fit.cost <= MAX_LEVEL * expected_level(log_residuals):
         return fit
     weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
     ratios = [new.weight / old.weight for new, old in zip(weighted, log_residuals, strict=True)]
@@ -117,7 +115,7 @@ def fit_with_misfit(
     white = min(ratios)
     return replace(
         fit,
-        cost=sum(float(values @ values) for values in entries) / count,
+        cost=sum(float(values @ values) for values in entries) / sum(map(len, entries)),
         held_out=held_out,
         white_errors={key: error / white for key, error in fit.white_errors.items()},
     )

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
-from twin.discovery.nuisances import TYPICAL_LIMITS
+from twin.discovery.nuisances import MAX_SIZE, TYPICAL_GAIN
 from twin.discovery.parameters import INPUT_GAIN, BaseKey, EffectKey, GapKey, SlipKey
 from twin.laws.effect import Effect
 from twin.laws.effect_file import format_effect_file
@@ -17,7 +17,7 @@ MIN_GAP_ERROR_M = 1e-6  # smaller gap corrections are not reported
 def _is_input_gain_off(fit: FitResult) -> bool:
     """Return True if the whole interval of the gain of the table's sensor is off by too much."""
     half = INTERVAL_SIGMA * fit.interval_error(INPUT_GAIN)
-    return abs(fit.parameters.values[INPUT_GAIN] - 1.0) - half > TYPICAL_LIMITS[INPUT_GAIN.effect]
+    return abs(fit.parameters.values[INPUT_GAIN] - 1.0) - half > MAX_SIZE * TYPICAL_GAIN
 
 
 def format_fitted_model(

@@ -62,15 +62,8 @@ WHITE_CYCLES = 0.05  # per sample
 TYPICAL_SHARE, TYPICAL_SHARE_SLOPE = 0.05, 0.02  # of the force; at the largest excursion
 TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
-TYPICAL_GAP_M, TYPICAL_MASS = 1e-4, 0.005  # of the readings of the set-up
+TYPICAL_GAP_M = 1e-4  # of the readings of the set-up
 MAX_SIZE = 4.0  # typical sizes: a larger error is a fault, or the specimen differs there
-# Smaller than these, effects that are errors of instruments or set-up are those of any laboratory.
-TYPICAL_LIMITS: Mapping[str, float] = {
-    "sensor_gain": MAX_SIZE * TYPICAL_GAIN,
-    "sensor_lag": MAX_SIZE * TYPICAL_LAG_S,
-    "mass_error": MAX_SIZE * TYPICAL_MASS,
-    "gap_offset": MAX_SIZE * TYPICAL_GAP_M,
-}
 SLOPE_STEP = 0.1  # of a typical size, for the finite difference
 MIN_COLUMN_NORM = 1.0  # a nuisance that changes the residual by less at its typical size is dropped
 
@@ -217,10 +210,7 @@ def linearize_nuisances(
         signals = correct_signals(signals, nuisance, z) if z else signals
     if calibrate:
         signals = signals.calibrate_noise()
-    bare = replace(
-        residuals, signals=signals, nuisances=None, motion_cache=[],
-        known_contact=residuals.contact_state,
-    )  # fmt: skip
+    bare = replace(residuals.with_signals(signals), nuisances=None)
     smooth = _smooth_signals(bare, parameters)
     before = bare.evaluate_rows(parameters, signals.fuse_corrected(smooth))
 
@@ -258,20 +248,13 @@ def fix_nuisances(residuals: LogResiduals, parameters: ParameterSet) -> LogResid
         return residuals
     for nuisance, z in zip(terms.nuisances, terms.values(parameters), strict=True):
         signals = correct_signals(signals, nuisance, float(z))
-    return replace(
-        residuals, signals=signals, nuisances=None, motion_cache=[],
-        known_contact=residuals.contact_state,
-    )  # fmt: skip
+    return replace(residuals.with_signals(signals), nuisances=None)
 
 
 def resolve_samples(residuals: LogResiduals, parameters: ParameterSet) -> LogResiduals:
     """Return the residuals with the samples as entries, less the fitted nuisances."""
     fixed = fix_nuisances(residuals, parameters)
-    signals = fixed.signals.in_whole_band
-    return replace(
-        fixed, signals=signals, is_sampled=True, motion_cache=[],
-        known_contact=residuals.contact_state,
-    )  # fmt: skip
+    return replace(fixed.with_signals(fixed.signals.in_whole_band), is_sampled=True)
 
 
 def _add_typical_noise(signals: LogSignals) -> LogSignals:

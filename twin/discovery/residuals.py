@@ -601,14 +601,12 @@ class LogResiduals:
         """
         known = {name: self.noise_scale.get(name, 1.0) for name in self.rows}
         signals = self.signals.add_noise(copy, known)
-        return replace(
-            self,
-            signals=signals,
-            motion_cache=[],
-            known_contact=self.contact_state,
-            fixed_noise=self._row_noise,
-            fixed_mask=self.row_mask,
-        )
+        fixed = self.with_signals(signals)
+        return replace(fixed, fixed_noise=self._row_noise, fixed_mask=self.row_mask)
+
+    def with_signals(self, signals: LogSignals) -> "LogResiduals":
+        """Return the residuals of other readings of the same test, with the same contacts."""
+        return replace(self, signals=signals, motion_cache=[], known_contact=self.contact_state)
 
     def with_learned_noise(
         self, parameters: ParameterSet, base: ParameterSet | None = None
@@ -820,8 +818,14 @@ class LogResiduals:
         return np.array(entries)
 
 
+def expected_level(log_residuals: Sequence[LogResiduals]) -> float:
+    """Return the mean square over the entries of all logs that instruments alone leave."""
+    squares = sum(r.expected_square * r.entry_row.size for r in log_residuals)
+    return squares / sum(r.entry_row.size for r in log_residuals)
+
+
 def build_log_residuals(
-    logs: Sequence[tuple[LogSignals, float]], reference: Model, weights: Sequence[float] = ()
+    logs: Sequence[tuple[LogSignals, float]], reference: Model
 ) -> tuple[LogResiduals, ...]:
     """Build the residuals of several logs, each (signals, contact threshold in N), on one scale."""
     motions = [signals.fuse_motion() for signals, _ in logs]
@@ -831,10 +835,9 @@ def build_log_residuals(
             readings[channel] = max(readings.get(channel, 0.0), signals.largest_reading(channel))
     scale = measure_scale(motions, readings)
     thinning = math.ceil(sum(int(m.moving.sum()) for m in motions) / MAX_SAMPLES) or 1
-    weighted = zip(logs, weights or [1.0] * len(logs), strict=True)
     return tuple(
-        LogResiduals(number, signals, contact_n, reference, scale, weight, thinning)
-        for number, ((signals, contact_n), weight) in enumerate(weighted)
+        LogResiduals(number, signals, contact_n, reference, scale, thinning=thinning)
+        for number, (signals, contact_n) in enumerate(logs)
     )
 
 

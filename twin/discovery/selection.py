@@ -17,7 +17,7 @@ from twin.discovery.candidates import Candidate, list_generic_candidates
 from twin.discovery.evidence import Hypothesis, LinearEvidence, build_evidence, softmax
 from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
-from twin.discovery.residuals import LogResiduals
+from twin.discovery.residuals import LogResiduals, expected_level
 from twin.discovery.screening import (
     NormalEquations,
     ScreenedCandidate,
@@ -55,11 +55,6 @@ class FittedSet:
     def held_out(self) -> tuple[Float1D, ...]:
         """Cross-validation residual over the noise of each log, (entry,)."""
         return self.fit.held_out
-
-    @property
-    def squares(self) -> float:
-        """Sum of squares of the residual over the noise, fitted to all data."""
-        return self.fit.cost * sum(values.size for values in self.held_out)
 
     def find_shape(self, effect: Candidate) -> tuple[float, ...]:
         """Return the fitted shape of one of the effects, in the order of its trial shapes."""
@@ -131,14 +126,13 @@ class SelectionProblem:
 
     @property
     def noise(self) -> float:
-        """Mean square of what instruments leave."""
+        """Mean square of the noise of sensors alone, of the log that shows it best."""
         return self.least_weight**-2
 
     @property
     def expected_square(self) -> float:
         """Mean square of the entries where the model is right: noise, and unknown errors."""
-        squares = [r.expected_square * r.entry_row.size for r in self.log_residuals]
-        return sum(squares) / sum(r.entry_row.size for r in self.log_residuals)
+        return expected_level(self.log_residuals)
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
@@ -219,8 +213,6 @@ class SelectionResult:
 
 class Cancelled(Exception):
     """Exception for a progress callback to stop the selection and keep the best set so far."""
-
-    fitted: tuple[FittedSet, ...] = ()  # sets completed in the cancelled round
 
 
 def select_effects(

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 from table_io.block import Bool2D, Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
+from twin.discovery.nuisances import list_sizes
 from twin.discovery.parameters import GapKey, NuisanceKey
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import MAX_EXPLAINED_COST
@@ -244,12 +245,11 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
 
     Lags are judged by pairs of sensors alone: a force law that is wrong would move them.
     """
-    signals, terms, number = residuals.signals, residuals.nuisances, residuals.log_number
+    signals, number = residuals.signals, residuals.log_number
     unequal = unequal_sd = 0.0
-    known = zip(terms.nuisances, terms.centre, strict=True) if terms else ()
-    for nuisance, centre in known:
+    for nuisance, z in list_sizes(residuals, fit.parameters):
         key = NuisanceKey(number, nuisance.kind, nuisance.place)
-        value = float(nuisance.size * (centre + fit.values.get(key, 0.0)))
+        value = nuisance.size * z
         sd = nuisance.size * fit.std_errors.get(key, 0.0)
         if nuisance.kind == "gap":
             unequal, unequal_sd = value, sd

@@ -36,7 +36,7 @@ MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 # Power over that of the noise above which a band holds forces, and the share of the corner of a
 # filter, or of the Nyquist frequency, up to which a channel is as it was measured.
 MIN_BAND_RATIO, BAND_OF_FILTER = 4.0, 0.7
-BAND_ROLL_OFF = 2.0  # end of the low pass of all channels over the end of that band
+BAND_ROLL_OFF = 2.0  # end of the low pass of the motion over the end of that band
 NOISE_SEED = 20_26  # of the copies of the noise: the same recording gives the same verdict
 MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
 BODY_SENSORS = (
@@ -86,8 +86,16 @@ class LogSignals:
 
     def pass_of(self, row: str) -> Float1D:
         """Return the low pass of a row that compares sensors, (frequency,)."""
-        is_whole = row in CELL_PAIRS and not derives_acc(self.channels)
-        return self.grid.low_pass if is_whole else self.low_pass
+        return self.read_pass if row in CELL_PAIRS else self.low_pass
+
+    @property
+    def read_pass(self) -> Float1D:
+        """Low pass of forces and accelerations as read, (frequency,).
+
+        Forces keep their steps, as those of a model have them. Beside a second derivative, which
+        has none, they are in its band.
+        """
+        return self.low_pass if derives_acc(self.channels) else self.grid.low_pass
 
     @property
     def in_whole_band(self) -> "LogSignals":
@@ -292,8 +300,6 @@ class _SensorFusion:
     def __init__(self, signals: LogSignals) -> None:
         self.signals, self.noise = signals, signals.noise
         self.grid, self.omega, self.low_pass = signals.grid, signals.omega, signals.low_pass
-        # forces keep their steps, as those of a model have them; a second derivative cannot
-        self.read_pass = self.low_pass if derives_acc(signals.channels) else self.grid.low_pass
         self.kept_share = self.grid.white_noise_rms(self.low_pass)
         self.weights: dict[str, _ChannelWeights] = {}
         self.sensitivity: dict[str, float] = {}  # of the consistency residuals
@@ -430,14 +436,14 @@ class _SensorFusion:
             if weights.consistency is not None:
                 series[weights.body] = self.grid.to_time_domain(spectrum * weights.consistency)
         if channel not in ("rel_disp_m", "mass_disp_m"):
-            series["read"] = self.grid.to_time_domain(spectrum * self.read_pass)
+            series["read"] = self.grid.to_time_domain(spectrum * self.signals.read_pass)
         return series
 
     def _filtered_rms(self, name: str) -> float:
         """Return the rms noise of a channel after the low pass, SI; NaN without the channel."""
         if name not in self.noise:
             return float("nan")
-        return self.grid.white_noise_rms(self.noise[name] * self.read_pass)
+        return self.grid.white_noise_rms(self.noise[name] * self.signals.read_pass)
 
     def _side_noise(self, cells: tuple[str, ...]) -> float:
         """Return the rms noise of the force of a side in N; NaN without load cells."""
