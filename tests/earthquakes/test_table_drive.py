@@ -2,8 +2,6 @@
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,11 +9,10 @@ import pytest
 from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
-from tests.builders.rigs import read_rig_text
 from tests.command_line import call_main
 from twin.earthquakes import task
 from twin.earthquakes.result import load_table_twin
-from twin.earthquakes.table_model import TableParameters
+from twin.earthquakes.table_model import TableModel, TableParameters
 from twin.recording.reader import read_recording
 from twin.setup.run_config import read_run_config
 
@@ -41,6 +38,14 @@ TWIN = """
 title = "Table"
 mass_kg = 2000.0
 residual = 0.01
+[judgement]
+structure = "hydraulic"
+on = "other logs"
+held_out = { pure_delay = 0.3, hydraulic = 0.02 }
+[[judgement.runs]]
+log = "other"
+band_hz = [0.5, 10.0]
+error = { twin = 0.02, pure_delay = 0.3, delay_gain = 0.3, frf = 0.1 }
 [parameters]
 gain_1_s = 20.0
 velocity_feedforward = 0.2
@@ -122,23 +127,20 @@ def test_the_run_of_another_target_does_not_correct_a_drive(folder: Path) -> Non
     assert "another target" in str(error.value)
 
 
-def test_the_search_for_effects_reports_its_stages(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        (TWIN[TWIN.index("[judgement]") : TWIN.index("[parameters]")], "", "not judged"),
+        ("twin = 0.02", "twin = 0.2", "other: error 0.2, frf 0.1"),
+    ],
+)
+def test_a_twin_without_a_judgement_or_that_lost_is_not_used(
+    folder: Path, old: str, new: str, words: str
 ) -> None:
-    stages: list[str] = []
-
-    def identify(*args: Any) -> None:
-        args[-1]("screening")
-        raise InputError("enough")
-
-    rig_toml = read_rig_text("hydraulic")
-    recording = SimpleNamespace(start=SimpleNamespace(rig_toml=rig_toml), run="run")
-    monkeypatch.setattr(task, "open_recording", lambda path: recording)
-    monkeypatch.setattr(task, "read_table_motion", lambda recording: None)
-    monkeypatch.setattr(task, "fit_table_twin_with_effects", identify)
-    with pytest.raises(InputError, match="enough"):
-        task.identify_table(task.TableTwinOptions(tmp_path / "run.mcap"), stages.append)
-    assert stages == ["screening"]
+    (folder / "table.toml").write_text(TWIN.replace(old, new))
+    with pytest.raises(InputError, match=words) as error:
+        task.compute_drive(task.TableDriveOptions(folder / "record.toml", folder / "table.toml"))
+    assert error.value.key == "judgement"
 
 
 @pytest.mark.parametrize(
@@ -180,7 +182,9 @@ def test_a_drive_beyond_the_limits_is_not_written_as_ready(folder: Path) -> None
 
 
 def test_a_table_twin_keeps_its_parameters(folder: Path) -> None:
-    parameters = load_table_twin(folder / "table.toml").build_model().parameters
+    model = load_table_twin(folder / "table.toml").build_model()
+    assert isinstance(model, TableModel)
+    parameters = model.parameters
     assert parameters.friction_n == 480.0
     assert parameters.valve_hz == TableParameters().valve_hz
     (folder / "table.toml").write_text(TWIN + "colour = 1.0\n")

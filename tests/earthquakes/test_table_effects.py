@@ -26,7 +26,7 @@ from tests.earthquakes.hydraulic_rig import (
 )
 from tests.earthquakes.planted_tables import PlantedTable, record_rehearsal
 from twin.earthquakes.drive_computation import compute_command, measure_error
-from twin.earthquakes.result import TableTwinResult, load_table_twin
+from twin.earthquakes.result import HYDRAULIC, Judgement, TableTwinResult, load_table_twin
 from twin.earthquakes.table_effects import (
     EFFECT_BY_ID,
     LIBRARY,
@@ -321,11 +321,16 @@ def measure_drive_errors(table: PlantedTable, *twins: TableParameters) -> list[f
 def test_the_file_keeps_the_effect(tmp_path: Path) -> None:
     discovery = rehearse_on_twin("transducer_gain")
     identification, motion = discovery.fit.to_identification(), discovery.fit.problem.motion
-    result = TableTwinResult("Table", identification, discovery, motion, Provenance())
+    judgement = Judgement(structure=HYDRAULIC, on="other logs", held_out={}, runs=())
+    result = TableTwinResult(
+        "Table", MASS_KG, identification.model, identification.residual, judgement,
+        identification, discovery, motion, Provenance(),
+    )  # fmt: skip
     path = result.save(tmp_path / "table.toml")
     config = load_table_twin(path)
     assert config.effects == ("transducer_gain",)
     model = config.build_model()
+    assert isinstance(model, TableModel)
     assert model.parameters.transducer_gain_error == pytest.approx(0.06, abs=0.01)
     assert model.frequency_response(np.zeros(1))[0] == pytest.approx(1.0 / 1.06, abs=0.01)
     path.write_text(path.read_text().replace("transducer_gain", "transducer_gaim"))

@@ -151,7 +151,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
         "discover runs/first --held-out runs/second --decide next.toml",
         "discover --features paper --out features"),
     "identify": ("identify last", "identify runs/first runs/second --out specimen.toml"),
-    "table-twin": ("table-twin last", "table-twin runs/rehearsal --out table.toml"),
+    "table-twin": (
+        "table-twin runs/rehearsal --out table.toml",
+        "table-twin runs/first runs/second --judge runs/third"),
     "verify": ("verify last", "verify runs/first --repair whole.mcap"),
     "import": ("import data.csv", "import data.csv -o data.mcap --accept --profile quickstart"),
     "export": ("export last --csv", "export runs/first --parquet --steps 0:5"),

@@ -6,11 +6,13 @@ from typing import Annotated
 import typer
 
 from twin.options import (
+    JsonOption,
     MeasuredLogArguments,
     OutOption,
     ProfileArgument,
     Speed,
     TableOption,
+    parse_measured_path,
     parse_run_path,
 )
 
@@ -66,8 +68,28 @@ def table_twin_command(
             "--effects/--no-effects", help="Name the effects that the table's twin lacks."
         ),
     ] = True,
+    judge: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--judge",
+            metavar="LOG",
+            parser=parse_measured_path,
+            help="Logs that are not fitted and judge the twin; omitted: parts of the fitted ones.",
+        ),
+    ] = None,
+    band_hz: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            "--band",
+            metavar="LOW HIGH",
+            help="Frequencies of fit and judgement, in Hz; omitted: where the table follows.",
+        ),
+    ] = None,
+    json: JsonOption = False,
 ) -> None:
-    """Identify the table itself from a rehearsal: oil, valve, friction, loop, frame, effects."""
+    """Identify the table itself from its logs: response, friction, oil, valve, loop, effects."""
     from twin.earthquakes.command import identify_table_command
+    from twin.earthquakes.task import TableTwinOptions
 
-    raise typer.Exit(identify_table_command(logs, out, with_effects))
+    options = TableTwinOptions(tuple(logs), with_effects, tuple(judge or ()), band_hz)
+    raise typer.Exit(identify_table_command(options, out, json))

@@ -1,6 +1,5 @@
 """`table-twin` and `table-drive`: identify the table, compute the command by which it follows."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,15 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from twin.earthquakes.figures import draw_table_twin
-from twin.earthquakes.result import PROFILE_FILE, DriveResult, TableTwinResult
+from twin.earthquakes.result import (
+    PROFILE_FILE,
+    DriveResult,
+    JudgedErrors,
+    TableTwinReport,
+    TableTwinResult,
+)
 from twin.earthquakes.table_effects import LIBRARY, describe_discovery
+from twin.earthquakes.table_identification import TableIdentification
 from twin.earthquakes.table_model import TableParameters
 from twin.earthquakes.task import (
     TableDriveOptions,
@@ -25,9 +31,10 @@ from twin.results.recordings import open_recording
 from twin.results.table_motion import summarise_tracking
 from twin.setup.folders import make_output_folder
 from twin.setup.run_config import make_run_id
-from twin.system.terminal import console, print_line, print_table, show_status
+from twin.system.terminal import console, error_console, print_line, print_table, show_status
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
+REFUSED_CODE = 2  # as of any bad input
 STOP_RATIO = 1.2  # of the smallest error so far: beyond it an iteration diverges
 UNITS = {
     "gain_1_s": "1/s", "delay_s": "s", "pressure_feedback_s": "s", "presliding_m": "m",
@@ -38,33 +45,73 @@ UNITS = {
 UNITS |= {parameter.name: parameter.unit for effect in LIBRARY for parameter in effect.parameters}
 
 
-def identify_table_command(logs: Sequence[Path], out: Path, with_effects: bool = True) -> int:
-    """Identify the twin of the table and its missing effects from a rehearsal; write a new file."""
+def identify_table_command(options: TableTwinOptions, out: Path, as_json: bool = False) -> int:
+    """Identify the twin of the table, judge it and write a new file; return the exit code.
+
+    A twin that loses to a baseline is not written: 2.
+    """
+    try:
+        result = _identify_and_write(options, out, quiet=as_json)
+    except InputError as error:
+        if not as_json:
+            raise
+        print(TableTwinReport(written=False, reason=str(error), runs=()).model_dump_json(indent=1))
+        return REFUSED_CODE
+    judgement = result.judgement
+    reason = judgement.explain_refusal()
+    if as_json:
+        report = TableTwinReport(written=not reason, reason=reason, runs=judgement.runs)
+        print(report.model_dump_json(indent=1))
+    elif reason:
+        error_console.print(f"nothing is written: {reason}", highlight=False, soft_wrap=True)
+    return REFUSED_CODE if reason else 0
+
+
+def _identify_and_write(options: TableTwinOptions, out: Path, quiet: bool) -> TableTwinResult:
+    """Return the twin of the table, written and drawn unless it is refused."""
     if out.suffix != ".toml":
         raise InputError("is no name for a table's twin", where=out, allowed="a file NAME.toml")
     drawing = out.with_suffix(".png")
     for path in (out, drawing):
         if path.exists():
             raise InputError("exists already", where=path, remedy="name a new file with --out")
-    if len(logs) != 1:
-        raise InputError(f"{len(logs)} recordings", allowed="one rehearsal of at most 60 s")
     with show_status("identifying the table") as show_part:
-        result = identify_table(TableTwinOptions(logs[0], with_effects), show_part)
-    result.save(out)
-    print_table(console, _make_parameter_table(result))
+        result = identify_table(options, show_part)
+    if not quiet:
+        _print_twin(result)
+    if not result.judgement.explain_refusal():
+        result.save(out)
+        draw_table_twin(result.model, result.rehearsal, result.title, drawing)
+        if not quiet:
+            print_line(f"it leaves {100 * result.residual:.2g} % of the measured motion -> {out}")
+            print_line(f"frequency response and steps -> {drawing}")
+    return result
+
+
+def _print_twin(result: TableTwinResult) -> None:
+    """Print parameters and effects of a hydraulic twin, and the judgement of any."""
+    if result.identification is not None:
+        print_table(console, _make_parameter_table(result.identification, result.title))
     for line in describe_discovery(result.discovery) if result.discovery is not None else ():
         print_line(line)
-    identification = result.identification
-    draw_table_twin(identification.model, result.rehearsal, result.title, drawing)
-    print_line(f"it leaves {100 * identification.residual:.2g} % of the measured motion -> {out}")
-    print_line(f"frequency response and steps -> {drawing}")
-    return 0
+    judgement = result.judgement
+    structures = Table("structure", "error, held out", title="structures of the twin")
+    for name, error in judgement.held_out.items():
+        used = " (used)" if name == judgement.structure else ""
+        structures.add_row(f"{name.replace('_', ' ')}{used}", f"{100 * error:.3g} %")
+    print_table(console, structures)
+    names = list(JudgedErrors.model_fields)
+    columns = ("log", "band in Hz", *(name.replace("_", " ") for name in names))
+    runs = Table(*columns, title=f"error of the acceleration on {judgement.on}")
+    for run in judgement.runs:
+        errors = (f"{100 * getattr(run.error, name):.3g} %" for name in names)
+        runs.add_row(run.log, f"{run.band_hz[0]:g} to {run.band_hz[1]:g}", *errors)
+    print_table(console, runs)
 
 
-def _make_parameter_table(result: TableTwinResult) -> Table:
+def _make_parameter_table(identification: TableIdentification, title: str) -> Table:
     """Return the table of the parameters of a twin with their intervals."""
-    identification = result.identification
-    table = Table("parameter", "value", "95 %", "unit", title=result.title)
+    table = Table("parameter", "value", "95 %", "unit", title=title)
     absent = TableParameters()._asdict()
     for name, value in identification.model.parameters._asdict().items():
         width = identification.half_widths.get(name)

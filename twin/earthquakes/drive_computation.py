@@ -16,8 +16,8 @@ from scipy.fft import next_fast_len
 
 from table_io.block import Float1D
 from table_io.config.excitation.waveform import smoothstep
-from twin.earthquakes.table_identification import CROSSOVER_HZ
 from twin.earthquakes.table_model import TableModel
+from twin.earthquakes.table_response import CROSSOVER_HZ, ResponseModel
 
 BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
 MAX_AMPLIFICATION = 5.0  # of the inverse
@@ -36,7 +36,7 @@ class TwinDrive:
 
 
 def compute_command(
-    model: TableModel,
+    model: TableModel | ResponseModel,
     target_m: Float1D,
     rate_hz: float,
     band_hz: tuple[float, float],
@@ -65,7 +65,10 @@ def compute_command(
 
 
 def compute_correction(
-    lacking_m: Float1D, model: TableModel, rate_hz: float, band_hz: tuple[float, float]
+    lacking_m: Float1D,
+    model: TableModel | ResponseModel,
+    rate_hz: float,
+    band_hz: tuple[float, float],
 ) -> Float1D:
     """Return the command for what the table lacks in m, (sample,), by the linear inverse."""
     count = lacking_m.size
@@ -96,7 +99,7 @@ class PlayedDrive:
 
 def correct_played_drive(
     run: PlayedDrive,
-    model: TableModel,
+    model: TableModel | ResponseModel,
     target_m: Float1D,
     reaction_n: Float1D,
     rate_hz: float,
@@ -135,7 +138,7 @@ def measure_error(
 
 
 def _invert_response(
-    model: TableModel, frequency_hz: Float1D, highest_hz: float
+    model: TableModel | ResponseModel, frequency_hz: Float1D, highest_hz: float
 ) -> npt.NDArray[np.complex128]:
     """Return the inverse of the linear response, tapered above the band and bounded."""
     response = model.frequency_response(frequency_hz)

@@ -5,10 +5,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import Field, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import ConfigModel, NonNegative, Positive, load_config
+from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, load_config
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.profile import Profile
 from table_io.config.provenance import Provenance
@@ -17,19 +17,93 @@ from table_io.errors import InputError, suggest
 from twin.earthquakes.table_effects import EFFECT_BY_ID, EffectDiscovery
 from twin.earthquakes.table_identification import TableIdentification, TableRehearsal
 from twin.earthquakes.table_model import TableModel, TableParameters
+from twin.earthquakes.table_response import STRUCTURE_BY_ID, Resonance, ResponseModel
 from twin.setup.run_config import RunConfig, read_run_config
 
 DRIVE_FILE, PROFILE_FILE = "drive.csv", "profile.toml"
+# Beyond this ratio and this error in addition a twin loses to a baseline: lag and gain of the
+# baselines are those of the judged log, so that a table that is but late would lose by a hair.
+MAX_LOSS_RATIO, MAX_LOSS = 1.005, 0.001
+HYDRAULIC = "hydraulic"  # structure of a twin by `TableParameters`
 DRIVE_LINE = re.compile(r"(?m)^drive\s*=.*\n")
 
 
+class JudgedErrors(ConfigModel):
+    """RMS error of the table's acceleration in the band over the RMS of the measured one."""
+
+    twin: NonNegative = Field(description="By the twin.")
+    pure_delay: NonNegative = Field(description="By the command with its lag in this log.")
+    delay_gain: NonNegative = Field(description="By the command with its lag and gain in it.")
+    frf: NonNegative = Field(description="By a smooth frequency response of the fitted logs.")
+
+
+class JudgedRun(ConfigModel):
+    """Judgement of a twin by one log."""
+
+    log: str = Field(description="Name of the run.")
+    band_hz: tuple[float, float] = Field(description="Band of the errors in Hz.")
+    error: JudgedErrors = Field(description="Errors of the twin and of its baselines.")
+
+    def name_better_baseline(self) -> str:
+        """Return the best baseline to which the twin loses; empty if it loses to none."""
+        baselines = self.error.model_dump(exclude={"twin"})
+        best = min(baselines, key=lambda name: float(baselines[name]))
+        limit = MAX_LOSS_RATIO * float(baselines[best]) + MAX_LOSS
+        return best if self.error.twin > limit else ""
+
+
+class Judgement(ConfigModel):
+    """Judgement of a table's twin on data that was not fitted."""
+
+    structure: str = Field(description="Structure of the twin.")
+    on: str = Field(description="What was left out of the fit.")
+    held_out: dict[str, float] = Field(description="Held-out error of each structure.")
+    runs: tuple[JudgedRun, ...] = Field(description="Errors by log.")
+
+    def explain_refusal(self) -> str:
+        """Return why the twin is refused, in words; empty if it loses to no baseline."""
+        lost = [(run, name) for run in self.runs if (name := run.name_better_baseline())]
+        parts = [
+            f"{run.log}: error {run.error.twin:.3g}, {name.replace('_', ' ')} "
+            f"{getattr(run.error, name):.3g}"
+            for run, name in lost
+        ]
+        return f"the twin loses to a baseline ({'; '.join(parts)})" if parts else ""
+
+
+class TableTwinReport(ConfigModel):
+    """What `table-twin --json` prints."""
+
+    written: bool
+    reason: str
+    runs: tuple[JudgedRun, ...]
+
+
+class ResponseConfig(ConfigModel):
+    """Response of a table to its command, `ResponseModel`."""
+
+    delay_s: Finite = Field(description="Delay of the whole command.")
+    band_hz: tuple[float, float] = Field(description="Band in Hz in which it corrects the command.")
+    lags_s: tuple[float, ...] = Field((), description="Lags of the smooth responses.")
+    coefficients: dict[str, tuple[float, ...]] = Field(
+        {}, description="By input: one for each lag, then two of the resonance."
+    )
+    resonance_hz: Positive | None = Field(None, description="Frequency of the resonance.")
+    resonance_damping: Positive | None = Field(None, description="Its damping ratio.")
+
+
 class TableTwinConfig(ConfigModel):
-    """Twin of a table: its moving mass, the parameters of `TableParameters` and intervals."""
+    """Twin of a table: the parameters of `TableParameters` or its response, and its judgement."""
 
     title: str = Field(description="Table and recordings that it was identified from.")
     mass_kg: Positive = Field(description="Moving mass without payload that forces refer to.")
     residual: NonNegative = Field(description="Share of the measured motion that it leaves, rms.")
-    parameters: dict[str, float] = Field(description="Parameters of the table's twin, SI.")
+    structure: str = Field(HYDRAULIC, description="Structure: hydraulic, or one of a response.")
+    response: ResponseConfig | None = Field(None, description="Response, if it is not hydraulic.")
+    judgement: Judgement | None = Field(
+        None, description="Errors on data that was not fitted; `table-drive` uses no twin without."
+    )
+    parameters: dict[str, float] = Field({}, description="Parameters of the hydraulic twin, SI.")
     half_widths: dict[str, float] = Field({}, description="Half widths of their 95 % intervals.")
     effects: tuple[str, ...] = Field((), description="Effects that the rehearsal showed.")
     provenance: Provenance | None = Field(
@@ -56,9 +130,37 @@ class TableTwinConfig(ConfigModel):
             )
         return effects
 
-    def build_model(self) -> TableModel:
+    @field_validator("response")
+    @classmethod
+    def _check_response(
+        cls, response: ResponseConfig | None, info: ValidationInfo
+    ) -> ResponseConfig | None:
+        structure = info.data.get("structure", HYDRAULIC)
+        if structure not in (HYDRAULIC, *STRUCTURE_BY_ID) or (
+            (structure == HYDRAULIC) != (response is None)
+        ):
+            raise InputError(
+                f"does not fit structure {structure!r}",
+                allowed=f"none of {HYDRAULIC}, one of {', '.join(STRUCTURE_BY_ID)}",
+            )
+        return response
+
+    def build_model(self) -> TableModel | ResponseModel:
         """Return the twin of the table."""
-        return TableModel(self.mass_kg, TableParameters(**self.parameters))
+        response = self.response
+        if response is None:
+            return TableModel(self.mass_kg, TableParameters(**self.parameters))
+        resonance = None
+        if response.resonance_hz is not None and response.resonance_damping is not None:
+            resonance = Resonance(response.resonance_hz, response.resonance_damping)
+        return ResponseModel(
+            self.structure,
+            response.delay_s,
+            response.band_hz,
+            response.lags_s,
+            response.coefficients,
+            resonance,
+        )
 
 
 def load_table_twin(path: Path) -> TableTwinConfig:
@@ -68,38 +170,72 @@ def load_table_twin(path: Path) -> TableTwinConfig:
 
 @dataclass(frozen=True, eq=False)
 class TableTwinResult:
-    """Identified twin of a table, the effects that were searched, and the rehearsal behind it."""
+    """Identified twin of a table, its judgement, and the motion behind it.
+
+    `identification` and the effects that were searched are those of the hydraulic structure, if it
+    was chosen. `rehearsal` is the motion of the first log, `motions` the number of the logs.
+    """
 
     title: str
-    identification: TableIdentification
+    mass_kg: float
+    model: TableModel | ResponseModel
+    residual: float
+    judgement: Judgement
+    identification: TableIdentification | None
     discovery: EffectDiscovery | None
     rehearsal: TableRehearsal
     provenance: Provenance
 
     def format_toml(self) -> str:
         """Return the text of the twin's file."""
-        identification, discovery = self.identification, self.discovery
-        values = identification.model.parameters._asdict()
-        widths = identification.half_widths
-        effects = [] if discovery is None else [finding.id for finding in discovery.findings]
-        return format_toml(
-            {
-                "title": self.title,
-                "mass_kg": identification.model.mass_kg,
-                "residual": float(f"{identification.residual:.4g}"),
-                "effects": effects,
+        model = self.model
+        text = {
+            "title": self.title,
+            "mass_kg": self.mass_kg,
+            "residual": float(f"{self.residual:.4g}"),
+            "structure": self.judgement.structure,
+        }
+        if self.identification is not None and isinstance(model, TableModel):
+            values, widths = model.parameters._asdict(), self.identification.half_widths
+            discovery = self.discovery
+            text |= {
+                "effects": [finding.id for finding in discovery.findings] if discovery else [],
                 "parameters": {name: float(f"{value:.9g}") for name, value in values.items()},
                 "half_widths": {name: float(f"{width:.3g}") for name, width in widths.items()},
-                "provenance": self.provenance.model_dump(),
             }
-        )
+        elif isinstance(model, ResponseModel):
+            text["response"] = _describe_response(model).model_dump(exclude_none=True)
+        text["judgement"] = self.judgement.model_dump()
+        text["provenance"] = self.provenance.model_dump()
+        return format_toml(text)
 
     def save(self, path: Path) -> Path:
-        """Write the twin's file and return its path; InputError if it exists."""
+        """Write the twin's file and return its path.
+
+        InputError if it exists, or if the twin loses to a baseline.
+        """
+        if reason := self.judgement.explain_refusal():
+            raise InputError(reason, where=path)
         if path.exists():
             raise InputError("exists already", where=path, remedy="give a new name")
         path.write_text(self.format_toml(), encoding="utf-8")
         return path
+
+
+def _describe_response(model: ResponseModel) -> ResponseConfig:
+    """Return a response as it stands in the file of a twin."""
+    resonance = model.resonance
+    return ResponseConfig(
+        delay_s=model.delay_s,
+        band_hz=model.band_hz,
+        lags_s=tuple(float(f"{lag:.9g}") for lag in model.lags_s),
+        coefficients={
+            name: tuple(float(f"{value:.9g}") for value in values)
+            for name, values in (model.coefficients or {}).items()
+        },
+        resonance_hz=None if resonance is None else resonance.hz,
+        resonance_damping=None if resonance is None else resonance.damping,
+    )
 
 
 @dataclass(frozen=True, eq=False)

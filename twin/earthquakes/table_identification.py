@@ -18,8 +18,8 @@ from scipy import optimize, stats
 from table_io.block import Float1D, Float2D, Int1D
 from table_io.errors import InputError
 from twin.earthquakes.table_model import TableModel, TableParameters
+from twin.earthquakes.table_response import CROSSOVER_HZ
 
-CROSSOVER_HZ = 1.5  # below: displacement; above: acceleration
 LOWEST_HZ, HIGHEST_HZ = 0.2, 45.0  # of the fit
 MIN_DURATION_S = 10.0
 CONFIDENCE_LEVEL = 0.95  # of the intervals
@@ -65,13 +65,26 @@ LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
 
 @dataclass(frozen=True, eq=False)
 class TableRehearsal:
-    """Rehearsal: command and table in SI, (sample,) each, from rest; reaction of the specimen."""
+    """Rehearsal: command and table in SI, (sample,) each, from rest; reaction of the specimen.
+
+    Without an accelerometer the acceleration is that of the displacement, below HIGHEST_HZ.
+    """
 
     rate_hz: float
     command_m: Float1D
     displacement_m: Float1D
     acceleration_m_s2: Float1D
     reaction_n: Float1D
+    has_accelerometer: bool = True
+
+    def cut(self, count: int) -> "TableRehearsal":
+        """Return the first samples."""
+        rows = {
+            row.name: getattr(self, row.name)[:count]
+            for row in fields(self)
+            if isinstance(getattr(self, row.name), np.ndarray)
+        }
+        return replace(self, **rows)
 
 
 @dataclass(frozen=True)
@@ -119,10 +132,7 @@ class RehearsalProblem:
             )
         # A length that is quick to transform; the table rests at the end.
         count -= count % LENGTH_STEP
-        motion = replace(
-            motion,
-            **{row.name: getattr(motion, row.name)[:count] for row in fields(motion)[1:]},
-        )
+        motion = motion.cut(count)
         frequency_hz = np.asarray(np.fft.rfftfreq(count, 1.0 / motion.rate_hz), np.float64)
         used = (frequency_hz >= LOWEST_HZ) & (frequency_hz <= HIGHEST_HZ)
         weights = _weigh_frequencies(motion, used)

@@ -1,7 +1,7 @@
 """Tasks: identify the twin of a table from a rehearsal, and compute a drive on it."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,14 +19,34 @@ from table_io.errors import InputError
 from twin.earthquakes.drive_computation import PlayedDrive, compute_command, correct_played_drive
 from twin.earthquakes.result import (
     DRIVE_LINE,
+    HYDRAULIC,
     DriveResult,
     TableTwinConfig,
     TableTwinResult,
     load_table_twin,
 )
-from twin.earthquakes.table_effects import fit_table_twin_with_effects
-from twin.earthquakes.table_identification import CROSSOVER_HZ, TableRehearsal, fit_table_twin
+from twin.earthquakes.table_effects import discover_table_effects
+from twin.earthquakes.table_identification import (
+    HIGHEST_HZ,
+    RehearsalProblem,
+    TableRehearsal,
+    fit_basic_twin,
+)
+from twin.earthquakes.table_judgement import (
+    MAX_RATE_SHARE,
+    NamedMotion,
+    check_motion,
+    choose_structure,
+    find_predictable_band,
+    fit_responses,
+    join_motions,
+    judge_fitted_logs,
+    judge_other_logs,
+    prepare_data,
+    try_hydraulic_fit,
+)
 from twin.earthquakes.table_model import TableModel
+from twin.earthquakes.table_response import CROSSOVER_HZ, BandProjection, ResponseModel
 from twin.recording.reader import Recording
 from twin.results.recordings import build_provenance, open_recording
 from twin.results.tracking import find_band
@@ -45,34 +65,80 @@ Report = Callable[[str], None]  # gets the stage of a task in words
 
 @dataclass(frozen=True)
 class TableTwinOptions:
-    """Rehearsal from which the twin of a table is identified, and whether effects are searched."""
+    """Logs from which the twin of a table is identified: a rehearsal, or runs of any kind.
 
-    log: Path
+    The twin is judged by the logs `judge`, or without them by parts of its own that are left out in
+    turn, in the band `band_hz`, which is found from the logs unless given.
+    """
+
+    logs: Path | tuple[Path, ...]
     with_effects: bool = True
+    judge: tuple[Path, ...] = ()
+    band_hz: tuple[float, float] | None = None
 
 
 def identify_table(
     options: TableTwinOptions, report: Report = lambda stage: None
 ) -> TableTwinResult:
-    """Identify the twin of a table from a rehearsal, with the effects that it shows.
+    """Identify the twin of a table from logs, in the simplest structure that is not worse.
 
-    InputError if the recording lacks channels or samples, or is no rehearsal.
+    The judgement of the result says how it predicts what was not fitted; a twin that loses to a
+    baseline cannot be saved. InputError, with the cause, if a recording lacks channels or samples,
+    or its motion is none from which a table can be known.
     """
-    recording = open_recording(options.log)
-    rig = parse_toml(recording.start.rig_toml, RigConfig, str(options.log))
-    stall_kn = rig.table_response.stall_force_kn
-    stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
-    rehearsal = read_table_motion(recording)
-    discovery = None
-    if options.with_effects:
-        identification, discovery = fit_table_twin_with_effects(
-            rehearsal, rig.moving_mass_kg, stall_n, report
-        )
-    else:
-        identification = fit_table_twin(rehearsal, rig.moving_mass_kg, stall_n)
-    title = f"{rig.title}, from {recording.run}"
-    provenance = build_provenance({recording.path: recording.start})
-    return TableTwinResult(title, identification, discovery, rehearsal, provenance)
+    paths = (options.logs,) if isinstance(options.logs, Path) else options.logs
+    recordings = [open_recording(path) for path in paths]
+    logs = [_read_named_motion(recording) for recording in recordings]
+    judges = [_read_named_motion(open_recording(path)) for path in options.judge]
+    if clash := {log.log for log in logs} & {log.log for log in judges}:
+        raise InputError("is fitted and judged", where="--judge", value=", ".join(sorted(clash)))
+    band_hz = options.band_hz or find_predictable_band(logs)
+    highest_hz = MAX_RATE_SHARE * min(log.motion.rate_hz for log in (*logs, *judges))
+    if not 0.0 < band_hz[0] < band_hz[1] <= highest_hz:
+        raise InputError(
+            "is no band of these logs", key="band_hz", value=band_hz,
+            allowed=f"low < high, in Hz, up to {highest_hz:.4g}",
+        )  # fmt: skip
+    data = prepare_data(logs, band_hz)
+    report("fitting responses of the table")
+    trials = fit_responses(data)
+    rig = parse_toml(recordings[0].start.rig_toml, RigConfig, str(paths[0]))
+    discovery = hydraulic = None
+    motion = join_motions(logs)
+    if motion is not None:
+        stall_kn = rig.table_response.stall_force_kn
+        stall_n = math.inf if stall_kn is None else 1e3 * stall_kn
+        report("fitting the twin of the table")
+        problem = RehearsalProblem.from_rehearsal(motion, rig.moving_mass_kg, stall_n)
+        hydraulic = fit_basic_twin(problem)
+        if options.with_effects:
+            discovery = discover_table_effects(hydraulic, report)
+            hydraulic = discovery.fit
+        # Before the frequency response: of equal errors, physical parameters are worth more.
+        trials.insert(2, try_hydraulic_fit(hydraulic, logs, data))
+    chosen = choose_structure(trials)
+    is_hydraulic = hydraulic is not None and chosen.id == HYDRAULIC
+    others = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
+    return TableTwinResult(
+        f"{rig.title}, from {recordings[0].run}{others}",
+        rig.moving_mass_kg,
+        chosen.model,
+        math.sqrt(hydraulic.cost) if hydraulic is not None and is_hydraulic else chosen.error,
+        judge_other_logs(chosen, trials, judges, band_hz)
+        if judges
+        else judge_fitted_logs(chosen, trials, logs, data),
+        hydraulic.to_identification() if hydraulic is not None and is_hydraulic else None,
+        discovery if is_hydraulic else None,
+        logs[0].motion,
+        build_provenance({recording.path: recording.start for recording in recordings}),
+    )
+
+
+def _read_named_motion(recording: Recording) -> NamedMotion:
+    """Return the motion of a recording; InputError if it says nothing of its table."""
+    named = NamedMotion(recording.run, read_table_motion(recording))
+    check_motion(named)
+    return named
 
 
 @dataclass(frozen=True)
@@ -108,7 +174,7 @@ class DriveComputation:
     rig: str
     target_m: Float1D
     reaction_n: Float1D
-    model: TableModel
+    model: TableModel | ResponseModel
     twin: TableTwinConfig
     twin_path: Path
     band_hz: tuple[float, float]
@@ -186,6 +252,13 @@ def prepare_drive_computation(
             remedy="the level of a stepped sine is tuned while it runs",
         )
     twin = load_table_twin(options.table_twin)
+    if twin.judgement is None or (lost := twin.judgement.explain_refusal()):
+        raise InputError(
+            "not judged on data that was not fitted" if twin.judgement is None else lost,
+            where=options.table_twin,
+            key="judgement",
+            remedy="identify it again with `shaketwin table-twin`",
+        )
     rig, notes = choose_rig(options, twin, profile, path)
     config = build_run_config(path.stem, profile, profile_toml, path, str(path), rig)
     if twin.provenance is not None:
@@ -276,10 +349,11 @@ def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
 def read_table_motion(recording: Recording) -> TableRehearsal:
     """Return command and table of a whole recording, from rest to rest.
 
-    The specimen's force on the table is that of its measured acceleration. InputError if samples
-    or channels are missing.
+    The specimen's force on the table is that of its measured acceleration. Without an accelerometer
+    the acceleration is the second derivative of the displacement. InputError if samples or other
+    channels are missing.
     """
-    block = _find_whole_block(recording)
+    block = _find_whole_block(recording, CHANNELS[:2])
     profile = _read_profile(recording)
     moving = np.flatnonzero(block.label != Label.REST)
     if moving.size == 0:
@@ -289,8 +363,17 @@ def read_table_motion(recording: Recording) -> TableRehearsal:
     last = min(int(moving[-1]) + margin, len(block))
     block = block.cut(block.index + first, block.index + last)
     reaction = _measure_reaction(block, profile)
-    command, displacement, acceleration = (block.channel(name) for name in CHANNELS)
-    return TableRehearsal(block.rate_hz, command, displacement, acceleration, reaction)
+    command, displacement = (block.channel(name) for name in CHANNELS[:2])
+    has_accelerometer = CHANNELS[2] in block.channels
+    if has_accelerometer:
+        acceleration = block.channel(CHANNELS[2])
+    else:
+        band_hz = 0.0, min(HIGHEST_HZ, MAX_RATE_SHARE * block.rate_hz)
+        projection = BandProjection(len(block), block.rate_hz, band_hz)
+        acceleration = projection.to_samples(projection.differentiate(displacement))
+    return TableRehearsal(
+        block.rate_hz, command, displacement, acceleration, reaction, has_accelerometer
+    )
 
 
 def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
@@ -346,8 +429,8 @@ def _read_profile(recording: Recording) -> Profile:
     return parse_toml(recording.start.profile_toml, Profile, str(recording.path))
 
 
-def _find_whole_block(recording: Recording) -> Block:
-    """Return the measured samples; InputError if some are missing."""
+def _find_whole_block(recording: Recording, needed: Sequence[str] = CHANNELS) -> Block:
+    """Return the measured samples; InputError if some are missing, or a needed channel."""
     blocks = recording.contiguous_blocks("meas")
     if len(blocks) != 1:
         raise InputError(
@@ -355,7 +438,7 @@ def _find_whole_block(recording: Recording) -> Block:
             where=recording.path,
             remedy="record the motion again without losses",
         )
-    missing = [name for name in CHANNELS if name not in blocks[0].channels]
+    missing = [name for name in needed if name not in blocks[0].channels]
     if missing:
         raise InputError(f"it has no {', '.join(missing)}", where=recording.path)
     used = [name for name in (*CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]

@@ -1,0 +1,418 @@
+"""Judgement of a table's twin on motion that it was not fitted to, and what a log must be for it.
+
+A twin is compared with three baselines in the band in which the table follows its command at all:
+the late command, the late command with a gain, both with the best values of the judged log itself,
+and a smooth frequency response from the fitted logs. Structures from a delay to the hydraulic table
+are fitted with parts of the time left out, and the simplest that is not worse is used.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy import signal
+
+from table_io.block import Float1D
+from table_io.errors import InputError
+from twin.earthquakes.result import HYDRAULIC, JudgedErrors, JudgedRun, Judgement
+from twin.earthquakes.table_effects import LIBRARY
+from twin.earthquakes.table_identification import (
+    BOUNDS,
+    HIGHEST_HZ,
+    MIN_DURATION_S,
+    TableFit,
+    TableRehearsal,
+    build_parameters,
+)
+from twin.earthquakes.table_model import TableModel
+from twin.earthquakes.table_response import (
+    STRUCTURES,
+    BandProjection,
+    ResponseData,
+    ResponseModel,
+    ResponseRegression,
+    find_delay,
+    find_resonance,
+    measure_held_out,
+)
+
+LOWEST_HZ = 0.3  # of a band
+MAX_RATE_SHARE = 0.4  # of the sampling rate, that a band may reach
+SEGMENT_S = 5.0  # of the estimate of the coherence
+FREQUENCY_STEP_HZ = 0.02  # at which it is read, so that each third octave has values
+SEGMENT_SHARE = 0.95  # of half overlapping Hann segments that count as independent
+OCTAVE, THIRD_OCTAVE = 2.0, 2.0 ** (1.0 / 3.0)
+# Least coherence, less its bias, at which anything is promised: share of the power of the motion.
+MIN_COHERENCE = 0.3
+MAX_FOREIGN_SHARE = 0.5  # of the power of the table's acceleration that is not the command's
+RESONANT_WIDTH_HZ, RESONANT_SHARE = 0.5, 0.5  # a band that holds most of it is a resonance
+PART_COUNT = 4  # of a single log, that are left out in turn
+MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler structure is not worse up to this
+MIN_CLIPPED_SAMPLES, MIN_CLIPPED_PARTS = 4, 2  # equal samples at an extreme, and how often
+MOVING_SHARE = 0.01  # of its peak by which the other signal moves while one is clipped
+MIN_CORRELATION = 0.5  # of channels of one motion, by size: less says nothing of their sign
+GAIN_LIMITS = 0.2, 5.0  # of displacement over command
+ACCELEROMETER_LIMITS = 0.7, 1.4  # of acceleration over the derivative of the displacement
+ACCELEROMETER_BAND_HZ = 0.8, 5.0  # where both are usually well above their noise
+MAX_ERROR = 1e3  # that is stated: a twin that diverges
+
+
+@dataclass(frozen=True, eq=False)
+class NamedMotion:
+    """Motion of a table and the name of the log that it is from."""
+
+    log: str
+    motion: TableRehearsal
+
+
+def check_motion(named: NamedMotion) -> None:
+    """Raise InputError with the cause if a log can neither fit nor judge a twin of its table."""
+    motion, log = named.motion, named.log
+    seconds = motion.command_m.size / motion.rate_hz
+    if seconds < MIN_DURATION_S:
+        raise InputError(
+            f"{seconds:.1f} s of motion say too little of a table",
+            where=log,
+            allowed=f"at least {MIN_DURATION_S:g} s",
+        )
+    command, displacement = (row - row[0] for row in (motion.command_m, motion.displacement_m))
+    for row, channel in ((command, "drive_disp_m"), (displacement, "table_disp_m")):
+        if not np.ptp(row) > 0.0:
+            raise InputError("does not change: the table rests", where=log, key=channel)
+    others = {"table_disp_m": (displacement, command), "drive_disp_m": (command, displacement)}
+    if motion.has_accelerometer:
+        others["table_acc_m_s2"] = (motion.acceleration_m_s2, command)
+    for channel, (row, other) in others.items():
+        if (count := _count_clipped_parts(row, other)) >= MIN_CLIPPED_PARTS:
+            raise InputError(
+                f"is clipped: it stays at an extreme value {count} times while the table moves",
+                where=log,
+                key=channel,
+                remedy="record the motion again within the range of the sensor",
+            )
+    correlation = float(np.corrcoef(command, displacement)[0, 1])
+    if correlation < -MIN_CORRELATION:
+        raise InputError(
+            f"is reversed: its correlation with the command is {correlation:.2f}",
+            where=log,
+            key="table_disp_m",
+            remedy="change the sign of this channel or that of drive_disp_m",
+        )
+    gain = float(np.std(displacement) / np.std(command))
+    if correlation > 0.9 and not GAIN_LIMITS[0] < gain < GAIN_LIMITS[1]:
+        raise InputError(
+            f"is {gain:.3g} times the command",
+            where=log,
+            key="table_disp_m",
+            remedy="state the unit of both displacements, or correct the span",
+        )
+    if motion.has_accelerometer:
+        _check_accelerometer(named)
+
+
+def _count_clipped_parts(row: Float1D, other: Float1D) -> int:
+    """Return how often a signal stays at one of its extremes while another one moves."""
+    count = 0
+    for extreme in (row.max(), row.min()):
+        edges = np.diff(np.concatenate([[0], (row == extreme).astype(int), [0]]))
+        starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+        for start, end in zip(starts, ends, strict=True):
+            is_long = end - start >= MIN_CLIPPED_SAMPLES
+            moves = np.ptp(other[start:end]) > MOVING_SHARE * np.abs(other).max()
+            count += bool(is_long and moves)
+    return count
+
+
+def _check_accelerometer(named: NamedMotion) -> None:
+    """Raise InputError if the accelerometer is not that of the measured displacement."""
+    motion = named.motion
+    projection = BandProjection(motion.command_m.size, motion.rate_hz, ACCELEROMETER_BAND_HZ)
+    expected = projection.to_rows(projection.differentiate(motion.displacement_m))
+    spectrum = np.fft.rfft(motion.acceleration_m_s2, projection.size)[projection.used]
+    measured = projection.to_rows(spectrum)
+    size = float(np.linalg.norm(expected) * np.linalg.norm(measured))
+    correlation = float(expected @ measured) / max(size, 1e-300)
+    gain = float(np.linalg.norm(measured) / max(float(np.linalg.norm(expected)), 1e-300))
+    if correlation < -MIN_CORRELATION:
+        raise InputError(
+            f"is reversed: its correlation with the displacement's second derivative is "
+            f"{correlation:.2f}",
+            where=named.log,
+            key="table_acc_m_s2",
+            remedy="change the sign of this channel",
+        )
+    low, high = ACCELEROMETER_LIMITS
+    if correlation > 0.8 and not low < gain < high:
+        raise InputError(
+            f"is {gain:.3g} times the second derivative of the displacement",
+            where=named.log,
+            key="table_acc_m_s2",
+            remedy="state its unit, or correct its sensitivity",
+        )
+
+
+def find_predictable_band(logs: Sequence[NamedMotion]) -> tuple[float, float]:
+    """Return the band in Hz in which the tables of logs follow their commands.
+
+    It is that of the third octaves round the most coherent one whose coherence, less its bias, is
+    at least MIN_COHERENCE. InputError if most of the motion is not the command's.
+    """
+    highest_hz = min(HIGHEST_HZ, *(MAX_RATE_SHARE * log.motion.rate_hz for log in logs))
+    edges_hz = np.array([LOWEST_HZ])
+    while edges_hz[-1] * THIRD_OCTAVE <= highest_hz:
+        edges_hz = np.append(edges_hz, edges_hz[-1] * THIRD_OCTAVE)
+    frequency_hz = np.arange(LOWEST_HZ, edges_hz[-1], FREQUENCY_STEP_HZ)
+    cross = np.zeros(frequency_hz.size, complex)
+    powers, segments = np.zeros((2, frequency_hz.size)), 0.0
+    for log in logs:
+        motion = log.motion
+        projection = BandProjection(motion.command_m.size, motion.rate_hz, (0.2, highest_hz))
+        measured = projection.to_rows(_transform(projection, motion))
+        commanded = projection.to_rows(projection.differentiate(motion.command_m))
+        rate_hz = measured.size * motion.rate_hz / motion.command_m.size
+        length = round(SEGMENT_S * rate_hz)
+        segments += SEGMENT_SHARE * (2.0 * measured.size / length - 1.0)
+        share = 1.0 / float(measured @ measured)
+        hz, own_cross = signal.csd(commanded, measured, rate_hz, nperseg=length)
+        cross += share * np.interp(frequency_hz, hz, own_cross)
+        for row, motion_row in enumerate((commanded, measured)):
+            power = signal.welch(motion_row, rate_hz, nperseg=length)[1]
+            powers[row] += share * np.interp(frequency_hz, hz, power)
+    coherence = np.abs(cross) ** 2 / np.maximum(powers[0] * powers[1], 1e-300)
+    coherence = np.clip(coherence - (1.0 - coherence) ** 2 / segments, 0.0, 1.0)
+    octave = np.searchsorted(edges_hz, frequency_hz, side="right") - 1
+    means = np.array([coherence[octave == k].mean() for k in range(edges_hz.size - 1)])
+    follows = means >= MIN_COHERENCE
+    foreign = (1.0 - coherence) * powers[1]
+    first = last = int(np.argmax(means))
+    if follows[first]:
+        while first > 0 and follows[first - 1]:
+            first -= 1
+        while last + 1 < means.size and follows[last + 1]:
+            last += 1
+        # Far above the band a displacement's derivative is noise, of which nothing is promised.
+        near = frequency_hz <= OCTAVE * edges_hz[last + 1]
+        frequency_hz = frequency_hz[near]
+        foreign = foreign[near]
+        powers = powers[:, near]
+        if foreign.sum() <= MAX_FOREIGN_SHARE * powers[1].sum():
+            return float(round(edges_hz[first], 3)), float(round(edges_hz[last + 1], 3))
+    raise _describe_foreign_motion(logs, frequency_hz, foreign, powers[1])
+
+
+def _describe_foreign_motion(
+    logs: Sequence[NamedMotion], frequency_hz: Float1D, foreign: Float1D, power: Float1D
+) -> InputError:
+    """Return the error for logs whose table hardly follows its command, with the cause."""
+    share = foreign.sum() / power.sum()
+    peak_hz = float(frequency_hz[int(np.argmax(foreign))])
+    near = np.abs(frequency_hz - peak_hz) <= RESONANT_WIDTH_HZ
+    cause = "the table's motion is mostly noise, or the channels are not of one run"
+    is_narrow = foreign[near].sum() > RESONANT_SHARE * foreign.sum()
+    if is_narrow and foreign[~near].sum() < MAX_FOREIGN_SHARE * power[~near].sum():
+        peak_hz = float(np.average(frequency_hz[near], weights=foreign[near]))
+        cause = (
+            f"the specimen or the loop shakes the table at {peak_hz:.1f} Hz, where the command "
+            "does not"
+        )
+    return InputError(
+        f"{100.0 * share:.0f} % of the power of the table's acceleration is not the command's: "
+        f"{cause}",
+        where=", ".join(log.log for log in logs),
+        allowed=f"at most {100.0 * MAX_FOREIGN_SHARE:.0f} %",
+    )
+
+
+def _transform(projection: BandProjection, motion: TableRehearsal) -> npt.NDArray[np.complex128]:
+    """Return the spectrum of the measured acceleration in the band, (frequency,)."""
+    acceleration = motion.acceleration_m_s2 if motion.has_accelerometer else None
+    return projection.transform_motion(motion.displacement_m, acceleration)
+
+
+@dataclass(frozen=True, eq=False)
+class StructureTrial:
+    """A structure fitted to logs: its model, its order of preference and what it leaves, held out.
+
+    `held_out` is the acceleration that it leaves of each log, (row,), by fits without the part.
+    """
+
+    id: str
+    model: TableModel | ResponseModel
+    held_out: tuple[Float1D, ...]
+    error: float
+
+
+def prepare_data(logs: Sequence[NamedMotion], band_hz: tuple[float, float]) -> list[ResponseData]:
+    """Return the logs in a band with the parts that are left out in turn.
+
+    These are whole logs, or PART_COUNT stretches of time of a single one.
+    """
+    data = []
+    for number, log in enumerate(logs):
+        motion = log.motion
+        projection = BandProjection(motion.command_m.size, motion.rate_hz, band_hz)
+        spectrum = _transform(projection, motion)
+        rows = projection.to_rows(spectrum).size
+        part = np.full(rows, number)
+        if len(logs) == 1:
+            part = np.arange(rows) * PART_COUNT // rows
+        data.append(ResponseData(projection, motion.command_m, spectrum, part))
+    return data
+
+
+def fit_responses(data: Sequence[ResponseData]) -> list[StructureTrial]:
+    """Return the fits of all structures of a response, from the simplest to the richest."""
+    delay_s = find_delay(data)
+    resonance = find_resonance(data, delay_s)
+    trials = []
+    for structure in STRUCTURES:
+        regression = ResponseRegression.from_data(structure, data, delay_s, resonance)
+        held_out = regression.held_out
+        error = measure_held_out(held_out, data)
+        trials.append(StructureTrial(structure.id, regression.build_model(), held_out, error))
+    return trials
+
+
+def try_hydraulic_fit(
+    fit: TableFit, logs: Sequence[NamedMotion], data: Sequence[ResponseData]
+) -> StructureTrial:
+    """Return the hydraulic twin with what it leaves of each part by a fit without that part.
+
+    That fit is one Gauss-Newton step from the parameters of all parts. It is given the measured
+    force of the specimen.
+    """
+    bounds = dict(BOUNDS)
+    for effect in LIBRARY:
+        bounds |= effect.bounds
+    low, high = (np.array([bounds[name][k] for name in fit.names]) for k in (1, 2))
+    count = sum(log.motion.command_m.size for log in logs)
+    block_rows = fit.problem.block.size - 1
+    left = [log.measured.copy() for log in data]
+    start = 0
+    for number, (log, own) in enumerate(zip(logs, data, strict=True)):
+        size = log.motion.command_m.size
+        for part in np.unique(own.part):
+            # Rows of the fit's residuals that lie in the time of this part of this log.
+            inside = np.flatnonzero(own.part == part)
+            first, last = (
+                (start + size * edge / own.part.size) / count * block_rows
+                for edge in (inside[0], inside[-1] + 1)
+            )
+            is_left_out = np.zeros(block_rows + 1, bool)
+            is_left_out[math.ceil(first) : math.floor(last)] = True
+            values = np.clip(fit.values + fit.step_without(is_left_out), low, high)
+            parameters = build_parameters(fit.names, values, fit.problem)
+            model = TableModel(fit.problem.mass_kg, parameters)
+            left[number][inside] -= _predict(model, log.motion, own)[inside]
+        start += size
+    model = TableModel(fit.problem.mass_kg, fit.parameters)
+    return StructureTrial(HYDRAULIC, model, tuple(left), measure_held_out(left, data))
+
+
+def choose_structure(trials: Sequence[StructureTrial]) -> StructureTrial:
+    """Return the simplest structure that is not worse on held-out time than the best."""
+    best = min(trial.error for trial in trials)
+    return next(trial for trial in trials if trial.error <= MAX_WORSE_RATIO * best)
+
+
+def join_motions(logs: Sequence[NamedMotion]) -> TableRehearsal | None:
+    """Return the motions of logs one after the other, each from rest to rest.
+
+    None if they have no accelerometer or different sampling rates.
+    """
+    motions = [log.motion for log in logs]
+    is_joined = len({motion.rate_hz for motion in motions}) == 1
+    if not is_joined or not all(motion.has_accelerometer for motion in motions):
+        return None
+    command, displacement, acceleration, reaction = (
+        np.concatenate(rows)
+        for rows in zip(*((m.command_m, m.displacement_m, m.acceleration_m_s2, m.reaction_n)
+                          for m in motions), strict=True)
+    )  # fmt: skip
+    return TableRehearsal(motions[0].rate_hz, command, displacement, acceleration, reaction)
+
+
+def judge_fitted_logs(
+    chosen: StructureTrial,
+    trials: Sequence[StructureTrial],
+    logs: Sequence[NamedMotion],
+    data: Sequence[ResponseData],
+) -> Judgement:
+    """Return the judgement of a twin by the parts of its own logs that were left out in turn."""
+    frf = next(trial for trial in trials if trial.id == "frf")
+    runs = []
+    for log, own, left, left_by_frf in zip(logs, data, chosen.held_out, frf.held_out, strict=True):
+        runs.append(_judge_run(log, own, left, left_by_frf))
+    return _build_judgement(chosen, trials, runs, "parts of the fitted logs, left out in turn")
+
+
+def judge_other_logs(
+    chosen: StructureTrial,
+    trials: Sequence[StructureTrial],
+    logs: Sequence[NamedMotion],
+    band_hz: tuple[float, float],
+) -> Judgement:
+    """Return the judgement of a twin by logs that were not fitted."""
+    frf = next(trial for trial in trials if trial.id == "frf")
+    runs = []
+    for log, own in zip(logs, prepare_data(logs, band_hz), strict=True):
+        left, left_by_frf = (
+            own.measured - _predict(trial.model, log.motion, own) for trial in (chosen, frf)
+        )
+        runs.append(_judge_run(log, own, left, left_by_frf))
+    return _build_judgement(chosen, trials, runs, "other logs")
+
+
+def _predict(
+    model: TableModel | ResponseModel, motion: TableRehearsal, data: ResponseData
+) -> Float1D:
+    """Return the acceleration that a twin predicts in the band in m/s2, (row,)."""
+    out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
+    if not np.isfinite(out).all():
+        return np.full(data.part.size, np.inf)
+    acceleration = out[1] if motion.has_accelerometer else None
+    return data.projection.to_rows(data.projection.transform_motion(out[0], acceleration))
+
+
+def _judge_run(
+    log: NamedMotion, data: ResponseData, left: Float1D, left_by_frf: Float1D
+) -> JudgedRun:
+    """Return the errors of a twin and of the baselines on one log."""
+    measured = data.measured
+    late = data.delay_command(find_delay([data]))
+    gain = float(late @ measured) / float(late @ late)
+    residuals = {
+        "twin": left,
+        "pure_delay": measured - late,
+        "delay_gain": measured - gain * late,
+        "frf": left_by_frf,
+    }
+    size = float(np.linalg.norm(measured))
+    errors = {
+        name: _round_error(float(np.linalg.norm(residual)) / size)
+        for name, residual in residuals.items()
+    }
+    return JudgedRun(
+        log=log.log, band_hz=data.projection.band_hz, error=JudgedErrors.model_validate(errors)
+    )
+
+
+def _build_judgement(
+    chosen: StructureTrial,
+    trials: Sequence[StructureTrial],
+    runs: Sequence[JudgedRun],
+    on: str,
+) -> Judgement:
+    return Judgement(
+        structure=chosen.id,
+        on=on,
+        held_out={trial.id: _round_error(trial.error) for trial in trials},
+        runs=tuple(runs),
+    )
+
+
+def _round_error(error: float) -> float:
+    """Return an error as it is stated, with five digits; a twin may diverge."""
+    return float(f"{min(error, MAX_ERROR):.5g}")
