@@ -227,7 +227,7 @@ class SampleGap:
     index: int
     count: int
     channel: str
-    reason: str  # "lost", "late", "clipped"
+    reason: str  # "lost", "late", "clipped", "stuck", "wild"
 
     @property
     def end(self) -> int:

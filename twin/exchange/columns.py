@@ -25,7 +25,9 @@ from table_io.formats import MAX_LISTED_COLUMNS
 from table_io.formats.table import ForeignTable
 from table_io.formats.timing import resolve_times
 from table_io.formats.words import TIME_UNITS, normalize_unit
+from table_io.records import SampleGap
 from table_io.units import UNITS
+from twin.compare.quality import ChannelDoubt, describe_gaps, find_bad_samples, find_doubts
 from twin.exchange.integration import (
     EXTERNAL_FORCE,
     convert_external_force,
@@ -33,6 +35,8 @@ from twin.exchange.integration import (
 )
 from twin.exchange.plausibility import list_implausible
 from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
+
+MAX_SAMPLES_PER_ROW = 10  # beyond, the rows are not one recording
 
 
 class ColumnSource(ConfigModel):
@@ -49,6 +53,9 @@ class ColumnSource(ConfigModel):
     )
     gain: Finite = Field(1.0, description="Factor on the column.")
     offset: Finite = Field(0.0, description="Added after scaling, in SI.")
+    trusted: bool = Field(
+        False, description="Its samples are right as they are, whatever they look like."
+    )
 
     @field_validator("gain")
     @classmethod
@@ -150,7 +157,8 @@ CANONICAL_COLUMNS = ImportColumns(CHANNEL_BY_NAME)
 class ImportedSamples:
     """Imported channels in SI, (row,) each, and the rising sample index of each row.
 
-    `labels` are the columns of LABEL_UNITS, all or none.
+    `labels` are the columns of LABEL_UNITS, all or none. `bad` samples are NaN in the channels;
+    `doubts` say what makes channels impossible.
     """
 
     rate_hz: float
@@ -158,6 +166,14 @@ class ImportedSamples:
     channels: dict[str, Float1D]
     notes: tuple[str, ...]
     labels: dict[str, Float1D] = field(default_factory=dict)
+    bad: tuple[SampleGap, ...] = ()
+    doubts: tuple[ChannelDoubt, ...] = ()
+
+    def to_grid(self, values: Float1D) -> Float1D:
+        """Return values, (row,), on the uniform time grid, (sample,); NaN in the holes."""
+        grid = np.full(int(self.index[-1]) + 1, np.nan)
+        grid[self.index] = values
+        return grid
 
 
 def read_samples(
@@ -214,9 +230,12 @@ def read_samples(
     missing = [name for name in known.channels if name not in channels]
     notes.append(f"not in the file: {', '.join(missing)}")
     notes += [f"{name}: all samples lost" for name in channels if np.isnan(channels[name]).all()]
-    notes += _check_plausibility(table, sources, channels, known, rate)
     labels = {name: values[name] for name in LABEL_UNITS if name in values}
     samples = ImportedSamples(rate, index, channels, (*table.notes, *notes), labels)
+    if not (table.texts or labels):  # an export of ours keeps every bit
+        samples = _judge_quality(samples, table, sources)
+    warnings = _check_plausibility(table, sources, samples.channels, known, rate)
+    samples = replace(samples, notes=(*samples.notes, *warnings))
     return condition_samples(samples, column_map) if column_map is not None else samples
 
 
@@ -371,6 +390,37 @@ def _select_rows(table: ForeignTable, column_map: ColumnMap, time: Float1D) -> t
         )
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     return rows, f"only {time[rows.start]:.6g} to {time[rows.stop - 1]:.6g} s of the file"
+
+
+def _judge_quality(
+    samples: ImportedSamples, table: ForeignTable, sources: Mapping[str, ColumnSource]
+) -> ImportedSamples:
+    """Return the samples without the bad ones, with what makes their channels impossible."""
+    size, rate_hz = int(samples.index[-1]) + 1, samples.rate_hz
+    if size > MAX_SAMPLES_PER_ROW * samples.index.size:
+        raise InputError(
+            f"{samples.index.size} rows over {size / rate_hz:.6g} s at {rate_hz:g} Hz: most "
+            "samples are missing",
+            where=table.path,
+            remedy="import its parts one by one",
+        )
+    channels = {
+        name: samples.to_grid(values)
+        for name, values in samples.channels.items()
+        if not (name in sources and sources[name].trusted)
+    }
+    bad = find_bad_samples(channels, rate_hz)
+    lines = [f"warning: {line}" for line in describe_gaps(bad, channels)]
+    for gap in bad:
+        channels[gap.channel][gap.index : gap.end] = np.nan
+    cleaned = {name: values[samples.index] for name, values in channels.items()}
+    return replace(
+        samples,
+        channels={**samples.channels, **cleaned},
+        notes=(*samples.notes, *lines),
+        bad=(*bad,),
+        doubts=(*find_doubts(channels, rate_hz),),
+    )
 
 
 def _check_plausibility(

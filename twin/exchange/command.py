@@ -174,6 +174,8 @@ def _print_proposal(file: Path, proposal: MapProposal) -> None:
     print_line(f"mass: {mass}")
     for text in (*proposal.left_out, *proposal.dropped):
         print_line(f"left out: {text}")
+    for text in proposal.findings:
+        print_line(text)
     for text in proposal.missing:
         print_line(f"missing: {text}")
     for text in proposal.questions:

@@ -49,7 +49,6 @@ MOTION_CHANNELS = (
 NO_REST = "nothing is taken as rest: no channel has a zero, noise is taken from the motion"
 MAX_REST_SHARE = 0.1  # of the range of the motion, by which a channel may be off zero at rest
 MAX_GAPS = 1000  # per channel: beyond, lost samples are only counted
-MAX_SAMPLES_PER_ROW = 10  # beyond, the rows are not one recording
 PLAIN_PROFILE = """\
 title = {title}
 notes = {notes}
@@ -81,11 +80,12 @@ SAMPLES_PER_CYCLE = 128  # of the placeholder; a power of two, so that no rate i
 
 @dataclass(frozen=True, eq=False)
 class _SampleGrid:
-    """Samples on the uniform time grid, values (channel, sample), NaN in the holes."""
+    """Samples on the uniform time grid, values (channel, sample), NaN in holes and bad samples."""
 
     channels: tuple[str, ...]
     values: Float2D
     holes: list[tuple[int, int]]
+    bad: tuple[SampleGap, ...] = ()
 
     @property
     def size(self) -> int:
@@ -165,7 +165,15 @@ def import_table(
     file_labels = read_labels(table, samples) if samples.labels else None
     mass_kg = column_map.mass_kg if column_map is not None else None
     config = _build_run_config(table, options, rig_toml, samples.rate_hz, file_labels, mass_kg)
-    grid = _to_grid(file, samples)
+    if samples.doubts:
+        remedies = dict.fromkeys(doubt.remedy for doubt in samples.doubts)
+        raise InputError(
+            "; ".join(doubt.problem for doubt in samples.doubts),
+            where=file,
+            remedy=f"{'; '.join(remedies)}; or, if that is how it was, state trusted = true for "
+            "the column in a --columns file",
+        )
+    grid = _to_grid(samples)
     labels = file_labels or _detect_labels(grid, config, on_grid=options.profile is not None)
     is_rest = column_map.rest if column_map is not None else None
     labels = _judge_rest(grid, labels, is_rest, is_component=options.profile is None)
@@ -221,12 +229,22 @@ def import_data(
 
 
 def propose_import(file: Path, options: ImportOptions) -> MapProposal:
-    """Return the proposed map of the columns of a file."""
+    """Return the proposed map of the columns of a file; what its samples leave open is asked."""
     if options.profile is not None:
         load_profile(options.profile)
     table = read_table(file)
     known = ImportColumns(read_channels(_read_rig_toml(table, options)))
-    return propose_map(table, known, options.settings)
+    proposal = propose_map(table, known, options.settings)
+    if proposal.questions:
+        return proposal
+    column_map = options.apply_settings(proposal.to_map())
+    try:
+        samples = read_samples(table, column_map, known, leave_out=True)
+    except InputError as error:
+        return replace(proposal, questions=(error.problem,))
+    findings = (note for note in samples.notes if note.startswith("warning: "))
+    questions = (f"{doubt.problem}: {doubt.remedy}, or trusted = true" for doubt in samples.doubts)
+    return replace(proposal, findings=(*findings,), questions=(*questions,))
 
 
 def _accept_proposal(
@@ -391,20 +409,10 @@ def _set_rate(profile_toml: str, rate_hz: float) -> str:
     return f"{before}\nrate_hz = {rate_hz!r}{without}{after[len(table) :]}"
 
 
-def _to_grid(file: Path, imported: ImportedSamples) -> _SampleGrid:
-    """Place the samples on the uniform time grid; raise InputError if most are missing."""
-    size = int(imported.index[-1]) + 1
-    if size > MAX_SAMPLES_PER_ROW * imported.index.size:
-        raise InputError(
-            f"{imported.index.size} rows over {size / imported.rate_hz:.6g} s at "
-            f"{imported.rate_hz:g} Hz: most samples are missing",
-            where=file,
-            remedy="import its parts one by one",
-        )
-    values = np.full((len(imported.channels), size), np.nan)
-    for row, channel in zip(values, imported.channels.values(), strict=True):
-        row[imported.index] = channel
-    return _SampleGrid(tuple(imported.channels), values, find_holes(imported.index))
+def _to_grid(imported: ImportedSamples) -> _SampleGrid:
+    """Place the samples on the uniform time grid."""
+    values = np.array([imported.to_grid(channel) for channel in imported.channels.values()])
+    return _SampleGrid(tuple(imported.channels), values, find_holes(imported.index), imported.bad)
 
 
 def _motion_signal(grid: _SampleGrid) -> tuple[Float1D, bool]:
@@ -449,15 +457,19 @@ def _iter_items(
 
 
 def _iter_lost_samples(grid: _SampleGrid) -> Iterator[Item]:
-    """Yield a SampleGap per stretch of lost samples of a channel, or one Event if too many."""
+    """Yield a SampleGap per stretch of lost or bad samples of a channel, an Event if too many."""
     is_hole = np.zeros(grid.size, dtype=bool)
     for first, count in grid.holes:
         is_hole[first : first + count] = True
     for name, values in zip(grid.channels, grid.values, strict=True):
+        bad = [gap for gap in grid.bad if gap.channel == name]
         is_lost = np.isnan(values) & ~is_hole
+        for gap in bad:
+            is_lost[gap.index : gap.end] = False
         edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)).reshape(-1, 2)
-        if len(edges) > MAX_GAPS:
-            yield Event(0, "warning", f"{name}: {int(is_lost.sum())} of {grid.size} samples lost")
+        gaps = [*bad, *(SampleGap(a, b - a, name, "lost") for a, b in edges.tolist())]
+        if len(gaps) > MAX_GAPS:
+            count = sum(gap.count for gap in gaps)
+            yield Event(0, "warning", f"{name}: {count} of {grid.size} samples lost")
             continue
-        for first, last in edges.tolist():
-            yield SampleGap(first, last - first, name, "lost")
+        yield from sorted(gaps, key=lambda gap: gap.index)

@@ -51,7 +51,7 @@ def compare_derivative(disp: Float1D, acc: Float1D, rate_hz: float) -> float:
     window = np.hanning(x.size)
     spectrum_x, spectrum_a = np.fft.rfft(x * window), np.fft.rfft(a * window)
     omega_squared = (2 * np.pi * rate_hz * np.fft.rfftfreq(x.size)) ** 2
-    product = np.abs(spectrum_x * spectrum_a)
+    product = np.abs(spectrum_x * spectrum_a)  # the hum of a second derivative would be loud
     is_loud = product >= MIN_LINE_SHARE * product.max()
     total = float(np.sum(np.abs(spectrum_a[is_loud]) ** 2))
     if not total:

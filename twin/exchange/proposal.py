@@ -82,6 +82,7 @@ class MapProposal:
     mass_kg: float | None = None
     questions: tuple[str, ...] = ()
     missing: tuple[str, ...] = ()
+    findings: tuple[str, ...] = ()  # on the quality of the samples
     left_out: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()  # with the reason why they are no columns
     alternatives: dict[str, tuple[str, ...]] = field(default_factory=dict)

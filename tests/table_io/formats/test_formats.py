@@ -35,7 +35,8 @@ pyuff = pytest.importorskip("pyuff")
 RATE, N = 200.0, 400
 TIME = np.arange(N) / RATE
 DISP: Float1D = 10.0 * np.sin(2 * np.pi * TIME) / 3  # mm
-FORCE: Float1D = 36.0 * DISP + 0.1
+FULL_FORCE: Float1D = 36.0 * DISP + 0.1
+FORCE = FULL_FORCE.copy()
 FORCE[7] = np.nan
 MAP: dict[str, Any] = {
     "rel_disp_m": {"column": "u", "unit": "mm"},
@@ -89,7 +90,7 @@ def tdms(path: Path) -> None:
 
 def uff(path: Path, binary: int, even: int = 1, spacing: float = 1 / RATE) -> None:
     file = pyuff.UFF(str(path))
-    for name, values, unit in (("u", DISP, "mm"), ("F", np.nan_to_num(FORCE), "N")):
+    for name, values, unit in (("u", DISP, "mm"), ("F", FULL_FORCE, "N")):
         file.write_sets(
             {
                 "type": 58, "binary": binary, "func_type": 1, "id1": name, "rsp_node": 1,
@@ -143,7 +144,7 @@ def import_table(table: ForeignTable, kind: str, **changed: Any) -> ImportedSamp
 def test_read_samples_of_every_format_are_equal(tmp_path: Path, kind: str) -> None:
     samples = import_table(make_table(tmp_path, kind), kind)
     assert (samples.rate_hz, samples.index.tolist()) == (RATE, list(range(N)))
-    force = np.nan_to_num(FORCE) if kind.startswith("uff") else FORCE  # UFF knows no lost sample
+    force = FULL_FORCE if kind.startswith("uff") else FORCE  # UFF knows no lost sample
     if kind == "uff text":  # twelve digits are all that it has
         np.testing.assert_allclose(samples.channels["rel_disp_m"], 1e-3 * DISP, rtol=1e-11)
         np.testing.assert_allclose(samples.channels["damper_force_n"], force, rtol=1e-11)
