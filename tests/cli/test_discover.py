@@ -81,15 +81,23 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> Made:
     return record_run(tmp_path_factory.mktemp("bad") / "plain")
 
 
-def change_log(source: Made, folder: Path, change: Callable[[str, Float1D], Float1D]) -> Path:
-    """The log of a table with other values in it."""
+def change_log(
+    source: Made, folder: Path, change: Callable[[str, Float1D], Float1D], trusted: str = ""
+) -> Path:
+    """The log of a table with other values in it; one channel may be taken as it is."""
     (piece,) = read_recording(source.log).contiguous_blocks("meas")
     columns = [change(name, piece.channel(name)) for name in piece.channels]
     table, log = folder / "table.csv", folder / "changed.mcap"
     rows = np.array([piece.time_s, *columns]).T
     head = ",".join(["time_s", *piece.channels])
     np.savetxt(table, rows, fmt="%.9g", delimiter=",", header=head, comments="")
-    import_table(table, log, ImportOptions(profile=source.profile))
+    column_map = None
+    if trusted:
+        column_map = folder / "map.toml"
+        column_map.write_text(
+            f'[columns]\n{trusted} = {{ column = "{trusted}", trusted = true }}\n'
+        )
+    import_table(table, log, ImportOptions(profile=source.profile, columns=column_map))
     return log
 
 
@@ -132,8 +140,11 @@ def test_a_load_cell_of_the_wrong_sign_is_refused(plain: Made, tmp_path: Path) -
     def flip_sign(name: str, values: Float1D) -> Float1D:
         return -values if name == "force_l2_n" else values
 
+    with pytest.raises(InputError, match="force_l2_n reads down to"):
+        change_log(plain, tmp_path, flip_sign)
+    log = change_log(plain, tmp_path, flip_sign, trusted="force_l2_n")
     with pytest.raises(InputError) as error:
-        load_logs([change_log(plain, tmp_path, flip_sign)])
+        load_logs([log])
     assert error.value.key == "force_l2_n"
 
 

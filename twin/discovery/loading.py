@@ -14,6 +14,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import SampleGap
+from twin.compare.quality import clean_blocks
 from twin.discovery.discover import PreparedLog
 from twin.discovery.signals import (
     LogSignals,
@@ -29,7 +30,6 @@ from twin.results.recordings import open_recording
 LOAD_CELLS = (*RIGHT_CELLS, *LEFT_CELLS)
 FORCE_CHANNELS = ("mass_acc_m_s2", "table_acc_m_s2", "damper_force_n")
 CLEAR_LOAD_FACTOR = 5.0  # times the contact threshold, or the opposite sign: certainly a load
-MIN_CLIPPED_SAMPLES = 10  # successive samples at the extreme value of a channel
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,9 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     profile = parse_toml(start.profile_toml, Profile, location)
     specimen, clipped = profile.specimen, recording.clipped_gaps
     recorded = recording.contiguous_blocks("meas")
-    blocks = tuple(_discard_samples(block, clipped) for block in recorded)
+    blocks, findings = clean_blocks(
+        [_discard_samples(block, clipped) for block in recorded], location
+    )
     dead = _find_dead_channels(blocks)
     signals = build_signals(
         _drop_incomplete_cells(blocks, dead), name, specimen.mass_kg, specimen.gaps_m
@@ -92,7 +94,7 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
     log = PreparedLog(signals, contact_n, start.steps)
     notes = _list_notes(recording, profile, signals, recorded, blocks, dead)
     clipping = _list_clipping_notes(name, clipped, recorded, blocks)
-    return LoadedLog(log, blocks, (*notes, *clipping))
+    return LoadedLog(log, blocks, (*(f"{name}: {line}" for line in findings), *notes, *clipping))
 
 
 def _discard_samples(block: Block, gaps: Sequence[SampleGap]) -> Block:
@@ -165,11 +167,7 @@ def _list_notes(
     for channel in blocks[0].channels if blocks else ():
         if channel not in CHANNEL_BY_NAME:
             continue  # declared in the rig file: not used
-        if _is_clipped(blocks, channel):
-            yield (
-                f"{name}: {channel} stays at its extreme value; it may be clipped: check its range"
-            )
-        elif lost := _count_missing(recorded, channel):
+        if lost := _count_missing(recorded, channel):
             yield f"{name}: {lost} samples of {channel} are lost; they are not used"
         if channel in dead:
             unused = ", so all load cells are ignored" if channel in LOAD_CELLS else ""
@@ -225,16 +223,3 @@ def _channel_extremes(blocks: Sequence[Block], channel: str) -> tuple[float, flo
     """Return (maximum, minus minimum) of a live channel."""
     values = np.concatenate([block.channel(channel) for block in blocks])
     return float(np.nanmax(values)), float(-np.nanmin(values))
-
-
-def _is_clipped(blocks: Sequence[Block], channel: str) -> bool:
-    values = np.concatenate([block.channel(channel) for block in blocks])
-    if not np.isfinite(values).any() or np.nanmax(values) == np.nanmin(values):
-        return False
-    for extreme in (np.nanmax(values), np.nanmin(values)):
-        if extreme == 0.0:
-            continue
-        runs = np.diff(np.flatnonzero(np.diff(np.r_[False, values == extreme, False])))[::2]
-        if runs.size and runs.max() >= MIN_CLIPPED_SAMPLES:
-            return True
-    return False
