@@ -24,7 +24,7 @@ UNIT_LINE = re.compile(r"\W*units?\s*[:=]\s*(\S+)", re.IGNORECASE)
 DAY_S = 86400.0
 CLOCK = re.compile(
     r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+)?"
-    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+)?))? ?([AP]M)?(?:Z|[-+]\d\d:?\d\d)?",
+    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+)?))? ?([AP]M)?(Z|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
 
@@ -212,7 +212,8 @@ def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
 
 
 class ClockReader:
-    """Converter of dates and times of day to seconds since the start of the first day."""
+    """Converter of dates and times of day to seconds since the start of the first day, in UTC
+    where they state their zone."""
 
     def __init__(self) -> None:
         self._first_day: int | None = None
@@ -225,11 +226,14 @@ class ClockReader:
             if text:
                 raise ValueError(text)
             return float("nan")
-        first, mark, second, third, hours, minutes, seconds, half = match.groups()
+        first, mark, second, third, hours, minutes, seconds, half, zone = match.groups()
         hour = int(hours)
         if half:
             hour = hour % 12 + 12 * (half.upper() == "PM")
         time_s = 3600.0 * hour + 60.0 * int(minutes) + float((seconds or "0").replace(",", "."))
+        if zone and zone not in "Zz":
+            ahead_s = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
+            time_s += ahead_s if zone[0] == "-" else -ahead_s
         if not first:
             return time_s
         year, month, day = int(first), int(second), int(third)

@@ -3,17 +3,27 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from nptdms import TdmsFile
 
 from table_io.formats.table import ColumnKey, ForeignColumn, ForeignTable
 
+SECOND = np.timedelta64(1, "s")
+
 
 def scan_columns(path: Path) -> ForeignTable:
-    """Scan the channels of a file; rate and start time are their waveform properties."""
+    """Scan the channels of a file; rate and start are their properties, from the first start."""
     with TdmsFile.open(path) as file:
         is_truncated = file.file_status.incomplete_final_segment
         notes = ("warning: the file ends inside a segment",) if is_truncated else ()
         table = ForeignTable(path, "", notes=notes, load=load_column)
+        begins = {
+            (group.name, channel.name): np.datetime64(channel.properties["wf_start_time"])
+            for group in file.groups()
+            for channel in group.channels()
+            if "wf_start_time" in channel.properties
+        }
+        first = min(begins.values(), default=np.datetime64(0, "us"))
         for group in file.groups():
             for channel in group.channels():
                 name = f"{group.name}/{channel.name}"
@@ -28,7 +38,8 @@ def scan_columns(path: Path) -> ForeignTable:
                     (group.name, channel.name),
                     str(properties.get("unit_string", "")),
                     1.0 / step if step > 0 else None,
-                    float(properties.get("wf_start_offset", 0.0)),
+                    (begins.get((group.name, channel.name), first) - first) / SECOND
+                    + float(properties.get("wf_start_offset", 0.0)),
                     group=group.name,
                 )
     return table

@@ -15,10 +15,16 @@ UNIT_SPELLINGS = {
     "newton": "N", "newtons": "N", "n": "N", "kn": "kN", "kips": "kip", "lb": "lbf", "lbs": "lbf",
     "pounds": "lbf", "volt": "V", "volts": "V", "v": "V", "mv": "mV",
     "°c": "degC", "degc": "degC", "celsius": "degC",
-    "sec": "s", "second": "s", "seconds": "s", "msec": "ms",
+    "sec": "s", "second": "s", "seconds": "s", "msec": "ms", "millisecond": "ms",
+    "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "minute": "min",
+    "minutes": "min", "mins": "min", "h": "hour", "hr": "hour", "hours": "hour", "d": "day",
+    "days": "day",
 }  # fmt: skip
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "min": 60.0}
+TIME_UNITS = {
+    "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "hour": 3600.0, "day": 86400.0,
+}  # fmt: skip
 KNOWN_UNITS = {*UNITS, *TIME_UNITS, "Hz", "-"}
+AMBIGUOUS_ENDINGS = ("d", "h")  # of a name: "acc_d" is not in days
 MASS_UNITS_KG = {"kg": 1.0, "t": 1e3, "ton": 1e3, "tons": 1e3, "tonnes": 1e3, "lb": 0.45359237}
 FACT_NAMES = {
     "rate_hz": (r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"),
@@ -77,7 +83,8 @@ def find_stated_unit(name: str, unit: str = "") -> str:
     words = re.split(r"[^a-zA-Z0-9/²]+", name.strip(" )]"))
     if len(words) > 2 and is_unit("/".join(words[-2:])):
         return normalize_unit("/".join(words[-2:]))
-    return normalize_unit(words[-1]) if len(words) > 1 and is_unit(words[-1]) else ""
+    has_unit = len(words) > 1 and is_unit(words[-1]) and words[-1].lower() not in AMBIGUOUS_ENDINGS
+    return normalize_unit(words[-1]) if has_unit else ""
 
 
 def split_words(name: str) -> list[str]:

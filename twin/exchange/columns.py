@@ -23,7 +23,12 @@ from table_io.config.base import ConfigModel, Finite, Positive
 from table_io.errors import InputError, suggest
 from table_io.formats import MAX_LISTED_COLUMNS
 from table_io.formats.table import ForeignTable
-from table_io.formats.timing import resolve_times
+from table_io.formats.timing import (
+    SAMPLE_UNIT,
+    align_starts,
+    check_unused_times,
+    resolve_times,
+)
 from table_io.formats.words import TIME_UNITS, normalize_unit
 from table_io.records import SampleGap
 from table_io.units import UNITS
@@ -124,7 +129,7 @@ class ImportColumns:
     def unit_factors(self, name: str) -> dict[str, float]:
         """Return the allowed units of a column and their factors to SI."""
         if name == TIME_COLUMN:
-            return TIME_UNITS
+            return {**TIME_UNITS, SAMPLE_UNIT: 1.0}
         si = self.recorded_unit(name)
         return {unit: factor for unit, (si_unit, factor) in UNITS.items() if si_unit == si} or (
             {si: 1.0} if si else {}
@@ -196,29 +201,34 @@ def read_samples(
         _check_unit(table, name, column, known.recorded_unit(name))
     table.check_size([source.column for source in sources.values()])
     infos = [table.columns[source.column] for source in sources.values()]
-    size, length_notes = _find_common_size(table, sources)
+    stated_hz = column_map.rate_hz if column_map is not None else None
+    rows, size, length_notes = _find_common_rows(table, sources)
     notes += length_notes
     values = {
-        name: source.to_si(name, table.read_column(source.column)[:size], known.unit_factors(name))
-        for name, source in sources.items()
+        name: source.to_si(
+            name,
+            table.read_column(source.column)[first : first + size],
+            _find_factors(source, known.unit_factors(name), stated_hz),
+        )
+        for (name, source), first in zip(sources.items(), rows, strict=True)
     }
     if _is_derived_disp(values):  # of an export of ours
         del values[RELATIVE_DISP]
         notes.append(f"left out: {RELATIVE_DISP}; it is the difference of two other channels")
-    stated_hz = column_map.rate_hz if column_map is not None else None
     time = values.pop(TIME_COLUMN, None)
     if time is None:
         time = _read_clock(table, sources, size)
-    rate, index, rate_notes = resolve_times(time, table, infos, stated_hz)
+    if time is None and stated_hz is not None:
+        check_unused_times(table, size, stated_hz)
+    times = resolve_times(time, table, infos, stated_hz)
     if column_map is not None and (column_map.from_s, column_map.to_s) != (None, None):
-        times = time if time is not None else infos[0].start_s + index / rate
-        rows, note = _select_rows(table, column_map, times)
-        values = {name: column[rows] for name, column in values.items()}
-        rate, index, rate_notes = resolve_times(
-            times[rows] if time is not None else None, table, infos, stated_hz
-        )
-        index = index[: rows.stop - rows.start]
+        seconds = time if time is not None else times.start_s + times.index / times.rate_hz
+        part, note = _select_rows(table, column_map, seconds)
+        values = {name: column[part] for name, column in values.items()}
+        times = resolve_times(time[part] if time is not None else None, table, infos, stated_hz)
+        times = replace(times, index=times.index[: part.stop - part.start])
         notes.append(note)
+    rate, index = times.rate_hz, times.index[: next(iter(values.values())).size]
     force = values.pop(EXTERNAL_FORCE, None)
     channels = {name: values[name] for name in known.channels if name in values}
     if force is not None:
@@ -226,7 +236,7 @@ def read_samples(
         channels |= convert_external_force(channels, force, mass_kg)
         channels = {name: channels[name] for name in known.channels if name in channels}
         notes.append(f"{EXTERNAL_FORCE} on the mass is recorded as a table acceleration, -F / M")
-    notes += rate_notes
+    notes += times.notes
     missing = [name for name in known.channels if name not in channels]
     notes.append(f"not in the file: {', '.join(missing)}")
     notes += [f"{name}: all samples lost" for name in channels if np.isnan(channels[name]).all()]
@@ -355,25 +365,52 @@ def _check_unit(table: ForeignTable, name: str, column: ColumnSource, recorded_u
     )
 
 
-def _find_common_size(
-    table: ForeignTable, sources: dict[str, ColumnSource]
-) -> tuple[int, list[str]]:
-    """Return (rows that all columns have, notes); InputError if no rate tells that they are the
-    same rows."""
-    columns = {source.column: table.columns[source.column] for source in sources.values()}
-    sizes = {name: column.size for name, column in columns.items()}
-    size = min(sizes.values())
-    if size == max(sizes.values()):
-        return size, []
-    lengths = _abbreviate([f"{name}: {count}" for name, count in sizes.items()])
-    times = {(column.rate_hz, column.start_s, bool(column.clock)) for column in columns.values()}
-    if len(times) > 1 or None in next(iter(times)):
+def _find_factors(
+    source: ColumnSource, factors: dict[str, float], stated_hz: float | None
+) -> dict[str, float]:
+    """Return the factors to SI of a column, with that of a count of samples at a stated rate."""
+    if source.unit != SAMPLE_UNIT:
+        return factors
+    if stated_hz is None:
         raise InputError(
-            f"columns of different length ({lengths})",
-            where=table.path,
-            remedy="select those of one recording by `group` in a --columns file, or one by one",
+            f"column {source.column!r} counts samples, and no rate is stated",
+            key="rate_hz",
+            remedy="state rate_hz in the map, or --rate HZ",
         )
-    return size, [f"warning: columns of different length ({lengths}): the first {size} are taken"]
+    return {SAMPLE_UNIT: 1.0 / stated_hz}
+
+
+def _find_common_rows(
+    table: ForeignTable, sources: dict[str, ColumnSource]
+) -> tuple[list[int], int, list[str]]:
+    """Return (first row of each column, rows that all have from there, notes); InputError if no
+    rate tells that they are the same rows."""
+    columns = [table.columns[source.column] for source in sources.values()]
+    firsts = align_starts(table, columns)
+    sizes = [column.size - first for column, first in zip(columns, firsts, strict=True)]
+    size = min(sizes)
+    lengths = _abbreviate(
+        [f"{source.column}: {c.size}" for source, c in zip(sources.values(), columns, strict=True)]
+    )
+    notes = []
+    if any(firsts):
+        starts = sorted({column.start_s for column in columns})
+        notes.append(
+            f"warning: the columns start at {starts[0]:.9g} to {starts[-1]:.9g} s: their common "
+            f"part of {size} samples is taken"
+        )
+    elif size < max(sizes):
+        times = {(column.rate_hz, bool(column.clock)) for column in columns}
+        if len(times) > 1 or None in next(iter(times)):
+            raise InputError(
+                f"{table.kind}; columns of different length ({lengths})",
+                where=table.path,
+                remedy="select those of one recording by `group` in a --columns file, or one by "
+                "one",
+            )
+        text = f"warning: columns of different length ({lengths}): the first {size} are taken"
+        notes.append(text)
+    return firsts, size, notes
 
 
 def _select_rows(table: ForeignTable, column_map: ColumnMap, time: Float1D) -> tuple[slice, str]:

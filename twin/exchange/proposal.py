@@ -14,9 +14,14 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, TIME_COLUMN
 from table_io.formats.table import ForeignTable
-from table_io.formats.timing import INTERVAL_SPREAD, find_time_column
+from table_io.formats.timing import (
+    MAX_INTERVAL_ERROR,
+    SAMPLE_UNIT,
+    check_rate,
+    find_time_column,
+    judge_time_unit,
+)
 from table_io.formats.words import (
-    TIME_UNITS,
     find_quantity,
     find_stated_unit,
     matches_words,
@@ -129,6 +134,11 @@ def propose_map(
     `settings` are keys of a map that the user states: they answer questions.
     """
     stated = {key: float((settings or {})[key]) for key in FACT_KEYS if key in (settings or {})}
+    file_hz = table.facts.get("rate_hz")
+    if "rate_hz" in stated and file_hz:
+        check_rate(
+            stated["rate_hz"], file_hz, table.path, table.kind, MAX_INTERVAL_ERROR, "rate_hz"
+        )
     table = replace(table, facts=table.facts | stated)
     names = [
         name
@@ -153,9 +163,12 @@ def propose_map(
                 alternatives[name] = free
                 candidates = " or ".join(free) or "no channel is left"
                 questions.append(f"column {name!r}: {quantity} of which body? {candidates}")
-    columns = [
-        ProposedColumn(TIME_COLUMN, time_column, *_propose_time_unit(table, time_column))
-    ] if time_column else []  # fmt: skip
+    columns: list[ProposedColumn] = []
+    if time_column:
+        judged = judge_time_unit(table, time_column, stated.get("rate_hz"))
+        unit = OPEN_UNIT if judged.question else judged.unit
+        columns.append(ProposedColumn(TIME_COLUMN, time_column, unit, judged.reason))
+        questions += [judged.question] if judged.question else []
     for channel, name in sorted(chosen.items(), key=lambda item: [*known.channels].index(item[0])):
         unit, reason, question = _propose_unit(table, channel, name, chosen, known)
         columns.append(ProposedColumn(channel, name, OPEN_UNIT if question else unit, reason))
@@ -163,7 +176,8 @@ def propose_map(
     infos = [table.columns[name] for name in names]
     file_rate_hz = next((info.rate_hz for info in infos if info.rate_hz), None)
     has_time = bool(time_column or file_rate_hz) or any(info.clock for info in infos)
-    rate_hz = None if has_time else table.facts.get("rate_hz")
+    counts_samples = bool(columns) and columns[0].unit == SAMPLE_UNIT
+    rate_hz = table.facts.get("rate_hz") if counts_samples or not has_time else None
     if not has_time and rate_hz is None:
         questions.append("no times and no sampling rate in the file: state --rate HZ")
     size = table.columns[names[0]].size if names else 0
@@ -208,11 +222,11 @@ def _select_recording(table: ForeignTable) -> list[str]:
     """Return the columns of one recording: of the most frequent length, or of its times."""
     sizes = [column.size for column in table.columns.values()]
     size = max(sizes, key=lambda length: (sizes.count(length), length))
-    rates = {(c.rate_hz, c.start_s) for c in table.columns.values() if c.size == size and c.rate_hz}
+    rates = {c.rate_hz for c in table.columns.values() if c.size == size and c.rate_hz}
     return [
         name
         for name, column in table.columns.items()
-        if column.size == size or (column.rate_hz, column.start_s) in rates
+        if column.size == size or column.rate_hz in rates
     ]
 
 
@@ -237,20 +251,6 @@ def _choose_channel(
     channel = CHANNEL_OF.get((quantity, body), "")
     is_ambiguous = not is_only and [*bodies.values()].count(body) > 1
     return "" if channel in chosen or is_ambiguous else channel
-
-
-def _propose_time_unit(table: ForeignTable, name: str) -> tuple[str, str]:
-    """Return (unit, reason) of a column of times."""
-    unit = find_stated_unit(name, table.columns[name].unit)
-    if unit in TIME_UNITS:
-        return unit, "stated in the file"
-    rate_hz = table.facts.get("rate_hz")
-    step = float(np.median(np.diff(table.read_column(name))))
-    if rate_hz:
-        for candidate, factor in TIME_UNITS.items():
-            if abs(step * factor * rate_hz - 1) < INTERVAL_SPREAD:
-                return candidate, f"agrees with the {rate_hz:g} Hz of the file"
-    return "s", f"a step of {step:.4g} s"
 
 
 def _propose_unit(

@@ -19,7 +19,12 @@ from table_io.channels import TIME_COLUMN
 from table_io.errors import InputError, suggest
 from table_io.formats import parse_text, read_table
 from table_io.formats.table import ForeignTable
-from table_io.formats.timing import MAX_INTERVAL_ERROR, check_rate, measure_rate
+from table_io.formats.timing import (
+    MAX_INTERVAL_ERROR,
+    check_plausible_rate,
+    check_rate,
+    measure_rate,
+)
 from table_io.formats.words import (
     TIME_UNITS,
     find_quantity,
@@ -156,6 +161,7 @@ def _find_rate(
         unit = find_stated_unit(time_name, table.columns[time_name].unit)
         rate_hz = measure_rate(TIME_UNITS.get(unit, 1.0) * table.read_column(time_name), table)
         source = f"column {time_name}"
+        check_plausible_rate(rate_hz, table, source)
     elif rate_hz is None:
         rate_hz = stated_hz or table.facts.get("rate_hz")
     if rate_hz is None:
