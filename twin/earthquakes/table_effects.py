@@ -29,6 +29,7 @@ from twin.earthquakes.table_identification import (
     build_parameters,
     fit_basic_twin,
     fit_table,
+    map_in_threads,
 )
 from twin.earthquakes.table_model import TableParameters
 
@@ -390,12 +391,17 @@ def screen_effects(current: EffectFit) -> list[ScreenedEffect]:
     fit, before = current.fit, current.gap**2
     base = HeldOutBase.from_fit(fit)
     screened = []
-    for effect in LIBRARY:
-        if effect in current.effects:
-            continue
+    effects = [effect for effect in LIBRARY if effect not in current.effects]
+    sizes = [(effect, trial) for effect in effects for trial in effect.trials]
+    slopes = dict(
+        zip(
+            sizes, map_in_threads(lambda size: _compute_trial_slope(fit, *size), sizes), strict=True
+        )
+    )
+    for effect in effects:
         trials = []
         for trial in effect.trials:
-            slope = _compute_trial_slope(fit, effect, trial)
+            slope = slopes[effect, trial]
             held_out = base.cross_validate(fit.residuals, slope)
             share = 1.0 - float(held_out @ held_out) / before
             size = base.solve_amplitude(slope, fit.residuals)

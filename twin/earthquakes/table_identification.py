@@ -6,10 +6,13 @@ accelerometer says little, the acceleration above, both as acceleration.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from types import MappingProxyType
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -60,7 +63,12 @@ MAX_FRAMES = 2  # a mode of the oil column may look like a frame
 ROUGH_EVALUATIONS = 6  # of the fits that only lead to a start
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
+MAX_THREADS = 8
 LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
+
+
+T = TypeVar("T")
+U = TypeVar("U")
 
 
 @dataclass(frozen=True, eq=False)
@@ -283,7 +291,7 @@ def fit_basic_twin(
         for values in product(*STARTING_VALUES.values())
         for trial in trials
     ]
-    first = min(starts, key=problem.measure_misfit)
+    first = starts[int(np.argmin(map_in_threads(problem.measure_misfit, starts)))]
     frameless = fit_table(
         problem,
         frameless_bounds,
@@ -293,7 +301,7 @@ def fit_basic_twin(
     )
     start |= frameless.scaled_values
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
-    misfits = np.array([problem.measure_misfit(frame) for frame in frames])
+    misfits = np.array(map_in_threads(problem.measure_misfit, frames))
     padded = np.pad(misfits, 1, constant_values=math.inf)
     is_minimum = (misfits <= padded[:-2]) & (misfits <= padded[2:])
     count = min(MAX_FRAMES, int(is_minimum.sum()))
@@ -302,6 +310,12 @@ def fit_basic_twin(
     rough = min(fits, key=lambda fit: fit.cost)
     near = fit_table(problem, bounds, rough.scaled_values, tolerance=1e-3)
     return fit_table(problem.with_noise_of(near), bounds, near.scaled_values)
+
+
+def map_in_threads(function: Callable[[T], U], items: Sequence[T]) -> list[U]:
+    """Return a function of each item; simulations release the interpreter's lock."""
+    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS)) as pool:
+        return list(pool.map(function, items))
 
 
 def fit_table(
@@ -323,12 +337,14 @@ def fit_table(
 
     def slopes(values: Float1D) -> Float2D:
         """Return the Jacobian by differences whose steps do not vanish with a parameter."""
-        before, jacobian = residuals(values), np.empty((problem.block.size, values.size))
+        trials = np.tile(values, (values.size + 1, 1))
         for index, size in enumerate(np.maximum(np.abs(values), typical)):
-            trial = values.copy()
             step = DIFFERENCE_STEP * size
-            trial[index] += -step if values[index] + step > high[index] else step
-            jacobian[:, index] = (residuals(trial) - before) / (trial[index] - values[index])
+            trials[index + 1, index] += -step if values[index] + step > high[index] else step
+        before, *after = map_in_threads(residuals, list(trials))
+        jacobian = np.empty((problem.block.size, values.size))
+        for index, changed in enumerate(after):
+            jacobian[:, index] = (changed - before) / (trials[index + 1, index] - values[index])
         return jacobian
 
     values = np.clip([start[name] for name in names], low, high)

@@ -29,19 +29,20 @@ q_t = (1 + g_t) (y - y_f - t_t v), which needs no state and differs by t_t^2 onl
 
 import math
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
-from table_io.compilation import jit_untyped_kernel
+from table_io.compilation import jit_helper, jit_untyped_kernel
 
 MAX_STEP_S = 2.6e-4  # of the integrator: a tenth of the period of the fastest valve
 PRESSURE_CORNER = math.tau * 1.0  # rad/s, below it the load is not fed back
 Y, V, OIL, VALVE, VALVE_RATE, LOW_OIL, FRAME, FRAME_SPEED, STATE_SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
 # States of effects in addition: second mode of the frame, and the stroke as the loop reads it.
 FRAME_2, FRAME_2_SPEED, STROKE_READ, EXTENDED_STATE_SIZE = 8, 9, 10, 11
+inline_untyped: Any = jit_helper(inlined=True)  # each call copies all parameters otherwise
 LEAST_FRICTION_SHARE = 0.05  # of the friction, however it changes along the stroke
 
 
@@ -84,7 +85,7 @@ class TableParameters(NamedTuple):
     friction_memory: float = 0.0
 
 
-@jit_untyped_kernel
+@inline_untyped
 def _find_stroke(s, p):  # type: ignore[no-untyped-def]
     """Return the stroke of the table on its frame in m and its rate in m/s."""
     stroke, v = s[Y] - s[FRAME], s[V] - s[FRAME_SPEED]
@@ -94,14 +95,14 @@ def _find_stroke(s, p):  # type: ignore[no-untyped-def]
     return stroke, v
 
 
-@jit_untyped_kernel
+@inline_untyped
 def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
     """Return the limit of |z| in this direction, at this stroke in m."""
     along = max(1.0 + p.friction_slope_1_m * stroke, LEAST_FRICTION_SHARE)
     return (1.0 + p.friction_asymmetry * sign) * along
 
 
-@jit_untyped_kernel
+@inline_untyped
 def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p, rate):  # type: ignore[no-untyped-def]
     """Write the time derivative of the state; SI.
 
@@ -163,7 +164,7 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p
         )
 
 
-@jit_untyped_kernel
+@inline_untyped
 def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-def]
     """Return z, the lagging Stribeck exponential and z of the valve after half a step h in s."""
     stroke, v = _find_stroke(s, p)
