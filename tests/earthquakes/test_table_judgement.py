@@ -198,11 +198,18 @@ def ring_by_itself(table: Float1D, seed: int) -> Float1D:
 
 
 def clip(table: Float1D, seed: int) -> Float1D:
-    return np.clip(table, -1.2 * table.std(), None)
+    noise = 2e-7 * np.random.default_rng(seed).standard_normal(table.size)
+    clipped: Float1D = np.clip(table, -1.2 * table.std(), None) + noise
+    return clipped
 
 
 def hold(table: Float1D, seed: int) -> Float1D:
     return np.full(table.size, 1e-3)
+
+
+def stick(table: Float1D, seed: int) -> Float1D:
+    count = table.size // 2 - 100
+    return np.where(np.arange(table.size) > count, table[count], table)
 
 
 SPOILED: dict[str, tuple[Callable[[Float1D, int], Float1D], str]] = {
@@ -212,6 +219,8 @@ SPOILED: dict[str, tuple[Callable[[Float1D, int], Float1D], str]] = {
     "reversed": (lambda table, seed: -table, "table_disp_m: is reversed"),
     "unit": (lambda table, seed: 1e3 * table, "times the command"),
     "dead": (hold, "table_disp_m: does not change"),
+    "stuck": (stick, "table_disp_m: is stuck from 29."),
+    "late": (lambda table, seed: np.roll(table, 200), "table_disp_m: is 1.0"),
 }
 
 
@@ -285,15 +294,14 @@ def test_the_command_judges_imported_logs_and_writes_what_does_not_lose(tmp_path
         logs.append(import_log(tmp_path, f"run{seed}", command, play_table(command, seed)))
     spoiled = import_log(tmp_path, "reversed", make_command(4), -play_table(make_command(4)))
     out = tmp_path / "table.toml"
-    options = ("--judge", logs[2], "--json", "--out", out)
-    result = call_main("table-twin", *logs[:2], *options)
+    result = call_main("table-twin", *logs[:2], "--judge", logs[2], "--json", "--out", out)
     assert result.returncode == 0
     printed = json.loads(result.stdout)
     assert list(printed) == ["written", "reason", "runs"]
     assert (printed["written"], printed["reason"]) == (True, "")
     (run,) = printed["runs"]
     assert list(run) == ["log", "band_hz", "error"]
-    assert run["log"].endswith("run2")
+    assert run["log"] == str(logs[2])
     assert list(run["error"]) == ["twin", "pure_delay", "delay_gain", "frf"]
     assert run["error"]["twin"] < 0.5 * run["error"]["pure_delay"]
     twin = load_table_twin(out)
@@ -306,14 +314,16 @@ def test_the_command_judges_imported_logs_and_writes_what_does_not_lose(tmp_path
     command = make_command(8)
     expected = again.model.simulate(command, RATE_HZ)
     np.testing.assert_allclose(twin.build_model().simulate(command, RATE_HZ), expected, rtol=1e-5)
-    options = ("--judge", spoiled, "--json", "--out", tmp_path / "other.toml")
-    refused = call_main("table-twin", *logs[:2], *options)
+    refused = call_main(
+        "table-twin", logs[0], "--judge", logs[2], spoiled, "--json",
+        "--out", tmp_path / "other.toml",
+    )  # fmt: skip
     assert refused.returncode == 2
     printed = json.loads(refused.stdout)
     assert (printed["written"], printed["runs"]) == (False, [])
     assert "table_disp_m: is reversed" in printed["reason"]
     assert not (tmp_path / "other.toml").exists()
-    with pytest.raises(InputError, match="fitted and judged"):
+    with pytest.raises(InputError, match="is fitted, and cannot judge"):
         identify_table(TableTwinOptions(tuple(logs), judge=(logs[2],)))
 
 

@@ -35,6 +35,7 @@ FILES = "Recording files"
 REFERENCE = "Reference"
 MARKUP: Literal["rich"] = "rich"
 FORMER_OPTIONS = {"--rig": "--table"}  # still accepted, not shown
+LIST_OPTIONS = ("--judge",)  # take all words up to the next option
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +196,20 @@ class CommandTable(TyperGroup):
         """Return name and command that the first word names, and the words that it takes."""
         name, _, words = super().resolve_command(ctx, args)
         (row,) = (row for row in COMMANDS if row.name == name)
-        return name, row.load(), [_replace_former(word) for word in words]
+        return name, row.load(), _repeat_list_options([_replace_former(word) for word in words])
+
+
+def _repeat_list_options(words: list[str]) -> list[str]:
+    """Return words in which an option of LIST_OPTIONS stands before each of its values."""
+    repeated: list[str] = []
+    option = ""
+    for word in words:
+        if word.startswith("-"):
+            option = word if word in LIST_OPTIONS else ""
+        elif option and repeated[-1] != option:
+            repeated.append(option)
+        repeated.append(word)
+    return repeated
 
 
 def _replace_former(word: str) -> str:

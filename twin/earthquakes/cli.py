@@ -72,7 +72,7 @@ def table_twin_command(
         list[Path] | None,
         typer.Option(
             "--judge",
-            metavar="LOG",
+            metavar="LOG...",
             parser=parse_measured_path,
             help="Logs that are not fitted and judge the twin; omitted: parts of the fitted ones.",
         ),

@@ -40,7 +40,7 @@ class JudgedErrors(ConfigModel):
 class JudgedRun(ConfigModel):
     """Judgement of a twin by one log."""
 
-    log: str = Field(description="Name of the run.")
+    log: str = Field(description="Log, as it was given.")
     band_hz: tuple[float, float] = Field(description="Band of the errors in Hz.")
     error: JudgedErrors = Field(description="Errors of the twin and of its baselines.")
 

@@ -47,12 +47,15 @@ OCTAVE, THIRD_OCTAVE = 2.0, 2.0 ** (1.0 / 3.0)
 # Least coherence, less its bias, at which anything is promised: share of the power of the motion.
 MIN_COHERENCE = 0.3
 MAX_FOREIGN_SHARE = 0.5  # of the power of the table's acceleration that is not the command's
-RESONANT_WIDTH_HZ, RESONANT_SHARE = 0.5, 0.5  # a band that holds most of it is a resonance
+RESONANT_WIDTH_HZ = 0.5  # on either side of a peak that is no command's
 PART_COUNT = 4  # of a single log, that are left out in turn
 MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler structure is not worse up to this
 MIN_CLIPPED_SAMPLES, MIN_CLIPPED_PARTS = 4, 2  # equal samples at an extreme, and how often
 MOVING_SHARE = 0.01  # of its peak by which the other signal moves while one is clipped
-MIN_CORRELATION = 0.5  # of channels of one motion, by size: less says nothing of their sign
+CLIPPING_TOLERANCE = 1e-4  # of the range, round an extreme: a clipped signal may carry noise
+MIN_HELD_S = 0.5  # of one value while the other signal moves
+MIN_CORRELATION = 0.7  # of channels of one motion, by size: less says nothing of sign and lag
+MAX_LAG_S, SEARCHED_LAG_S = 0.5, 5.0  # of a slow table, and of a log on two clocks
 GAIN_LIMITS = 0.2, 5.0  # of displacement over command
 ACCELEROMETER_LIMITS = 0.7, 1.4  # of acceleration over the derivative of the displacement
 ACCELEROMETER_BAND_HZ = 0.8, 5.0  # where both are usually well above their noise
@@ -85,20 +88,22 @@ def check_motion(named: NamedMotion) -> None:
     if motion.has_accelerometer:
         others["table_acc_m_s2"] = (motion.acceleration_m_s2, command)
     for channel, (row, other) in others.items():
-        if (count := _count_clipped_parts(row, other)) >= MIN_CLIPPED_PARTS:
-            raise InputError(
-                f"is clipped: it stays at an extreme value {count} times while the table moves",
-                where=log,
-                key=channel,
-                remedy="record the motion again within the range of the sensor",
-            )
-    correlation = float(np.corrcoef(command, displacement)[0, 1])
+        _check_saturation(log, channel, row, other, motion.rate_hz)
+    correlation, lag_s = _correlate(command, displacement, motion.rate_hz)
     if correlation < -MIN_CORRELATION:
         raise InputError(
             f"is reversed: its correlation with the command is {correlation:.2f}",
             where=log,
             key="table_disp_m",
             remedy="change the sign of this channel or that of drive_disp_m",
+        )
+    if correlation > MIN_CORRELATION and abs(lag_s) > MAX_LAG_S:
+        raise InputError(
+            f"is {lag_s:.2f} s late behind the command: the two are not of one clock",
+            where=log,
+            key="table_disp_m",
+            allowed=f"up to {MAX_LAG_S:g} s",
+            remedy="align the channels before the import",
         )
     gain = float(np.std(displacement) / np.std(command))
     if correlation > 0.9 and not GAIN_LIMITS[0] < gain < GAIN_LIMITS[1]:
@@ -112,17 +117,51 @@ def check_motion(named: NamedMotion) -> None:
         _check_accelerometer(named)
 
 
-def _count_clipped_parts(row: Float1D, other: Float1D) -> int:
-    """Return how often a signal stays at one of its extremes while another one moves."""
-    count = 0
-    for extreme in (row.max(), row.min()):
-        edges = np.diff(np.concatenate([[0], (row == extreme).astype(int), [0]]))
-        starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-        for start, end in zip(starts, ends, strict=True):
-            is_long = end - start >= MIN_CLIPPED_SAMPLES
-            moves = np.ptp(other[start:end]) > MOVING_SHARE * np.abs(other).max()
-            count += bool(is_long and moves)
-    return count
+def _check_saturation(log: str, channel: str, row: Float1D, other: Float1D, rate_hz: float) -> None:
+    """Raise InputError if a signal stays at a value, or at an extreme, while another one moves."""
+
+    def list_parts(stays: npt.NDArray[np.bool_], least: float) -> list[int]:
+        """Return the first samples of parts in which one stays and the other moves."""
+        edges = np.diff(np.concatenate([[0], stays.astype(int), [0]]))
+        parts = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
+        limit = MOVING_SHARE * np.abs(other).max()
+        return [
+            int(start)
+            for start, end in parts
+            if end - start >= least and np.ptp(other[start:end]) > limit
+        ]
+
+    tolerance = CLIPPING_TOLERANCE * np.ptp(row)
+    clipped = [
+        start
+        for stays in (row >= row.max() - tolerance, row <= row.min() + tolerance)
+        for start in list_parts(stays, MIN_CLIPPED_SAMPLES)
+    ]
+    if len(clipped) >= MIN_CLIPPED_PARTS:
+        raise InputError(
+            f"is clipped: it stays at an extreme value {len(clipped)} times while the table moves",
+            where=log,
+            key=channel,
+            remedy="record the motion again within the range of the sensor",
+        )
+    if held := list_parts(np.diff(row) == 0.0, MIN_HELD_S * rate_hz):
+        raise InputError(
+            f"is stuck from {held[0] / rate_hz:.1f} s of the motion: its value does not change "
+            "while the table moves",
+            where=log,
+            key=channel,
+            remedy="leave that part out at the import",
+        )
+
+
+def _correlate(command: Float1D, displacement: Float1D, rate_hz: float) -> tuple[float, float]:
+    """Return the correlation of largest size of two motions and its lag in s, positive if late."""
+    first, second = (row - row.mean() for row in (command, displacement))
+    correlation = signal.correlate(second, first, "same") / np.sqrt(first @ first * second @ second)
+    lags = np.arange(first.size) - first.size // 2
+    correlation[np.abs(lags) > SEARCHED_LAG_S * rate_hz] = 0.0
+    best = int(np.argmax(np.abs(correlation)))
+    return float(correlation[best]), float(lags[best] / rate_hz)
 
 
 def _check_accelerometer(named: NamedMotion) -> None:
@@ -186,7 +225,9 @@ def find_predictable_band(logs: Sequence[NamedMotion]) -> tuple[float, float]:
     means = np.array([coherence[octave == k].mean() for k in range(edges_hz.size - 1)])
     follows = means >= MIN_COHERENCE
     foreign = (1.0 - coherence) * powers[1]
+    _refuse_resonance(logs, frequency_hz, foreign, powers[1])
     first = last = int(np.argmax(means))
+    share = 1.0
     if follows[first]:
         while first > 0 and follows[first - 1]:
             first -= 1
@@ -194,35 +235,33 @@ def find_predictable_band(logs: Sequence[NamedMotion]) -> tuple[float, float]:
             last += 1
         # Far above the band a displacement's derivative is noise, of which nothing is promised.
         near = frequency_hz <= OCTAVE * edges_hz[last + 1]
-        frequency_hz = frequency_hz[near]
-        foreign = foreign[near]
-        powers = powers[:, near]
-        if foreign.sum() <= MAX_FOREIGN_SHARE * powers[1].sum():
-            return float(round(edges_hz[first], 3)), float(round(edges_hz[last + 1], 3))
-    raise _describe_foreign_motion(logs, frequency_hz, foreign, powers[1])
+        share = foreign[near].sum() / powers[1, near].sum()
+    if share > MAX_FOREIGN_SHARE:
+        raise InputError(
+            f"{100.0 * share:.0f} % of the power of the table's acceleration is not the command's: "
+            "it is mostly noise, or the channels are not of one run",
+            where=", ".join(log.log for log in logs),
+            allowed=f"at most {100.0 * MAX_FOREIGN_SHARE:.0f} %",
+        )
+    return float(round(edges_hz[first], 3)), float(round(edges_hz[last + 1], 3))
 
 
-def _describe_foreign_motion(
+def _refuse_resonance(
     logs: Sequence[NamedMotion], frequency_hz: Float1D, foreign: Float1D, power: Float1D
-) -> InputError:
-    """Return the error for logs whose table hardly follows its command, with the cause."""
-    share = foreign.sum() / power.sum()
+) -> None:
+    """Raise InputError if most of the power is in a narrow band and is not the command's."""
     peak_hz = float(frequency_hz[int(np.argmax(foreign))])
     near = np.abs(frequency_hz - peak_hz) <= RESONANT_WIDTH_HZ
-    cause = "the table's motion is mostly noise, or the channels are not of one run"
-    is_narrow = foreign[near].sum() > RESONANT_SHARE * foreign.sum()
-    if is_narrow and foreign[~near].sum() < MAX_FOREIGN_SHARE * power[~near].sum():
+    share = foreign[near].sum() / power.sum()
+    elsewhere = foreign[~near].sum() / power[~near].sum()
+    if share > MAX_FOREIGN_SHARE > elsewhere:
         peak_hz = float(np.average(frequency_hz[near], weights=foreign[near]))
-        cause = (
+        raise InputError(
             f"the specimen or the loop shakes the table at {peak_hz:.1f} Hz, where the command "
-            "does not"
+            f"does not: {100.0 * share:.0f} % of the power of its acceleration",
+            where=", ".join(log.log for log in logs),
+            allowed=f"at most {100.0 * MAX_FOREIGN_SHARE:.0f} %",
         )
-    return InputError(
-        f"{100.0 * share:.0f} % of the power of the table's acceleration is not the command's: "
-        f"{cause}",
-        where=", ".join(log.log for log in logs),
-        allowed=f"at most {100.0 * MAX_FOREIGN_SHARE:.0f} %",
-    )
 
 
 def _transform(projection: BandProjection, motion: TableRehearsal) -> npt.NDArray[np.complex128]:
@@ -247,17 +286,18 @@ class StructureTrial:
 def prepare_data(logs: Sequence[NamedMotion], band_hz: tuple[float, float]) -> list[ResponseData]:
     """Return the logs in a band with the parts that are left out in turn.
 
-    These are whole logs, or PART_COUNT stretches of time of a single one.
+    These are whole logs, or PART_COUNT stretches of time of a single one, of equal energy.
     """
     data = []
     for number, log in enumerate(logs):
         motion = log.motion
         projection = BandProjection(motion.command_m.size, motion.rate_hz, band_hz)
         spectrum = _transform(projection, motion)
-        rows = projection.to_rows(spectrum).size
-        part = np.full(rows, number)
+        measured = projection.to_rows(spectrum)
+        part = np.full(measured.size, number)
         if len(logs) == 1:
-            part = np.arange(rows) * PART_COUNT // rows
+            energy = np.cumsum(measured**2)
+            part = np.minimum((PART_COUNT * energy / energy[-1]).astype(int), PART_COUNT - 1)
         data.append(ResponseData(projection, motion.command_m, spectrum, part))
     return data
 

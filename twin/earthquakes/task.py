@@ -88,10 +88,13 @@ def identify_table(
     """
     paths = (options.logs,) if isinstance(options.logs, Path) else options.logs
     recordings = [open_recording(path) for path in paths]
-    logs = [_read_named_motion(recording) for recording in recordings]
-    judges = [_read_named_motion(open_recording(path)) for path in options.judge]
-    if clash := {log.log for log in logs} & {log.log for log in judges}:
-        raise InputError("is fitted and judged", where="--judge", value=", ".join(sorted(clash)))
+    judging = [open_recording(path) for path in options.judge]
+    fitted = {recording.path.resolve() for recording in recordings}
+    for recording in judging:
+        if recording.path.resolve() in fitted:
+            raise InputError("is fitted, and cannot judge", where=recording.path)
+    logs = [_read_named_motion(*pair) for pair in zip(paths, recordings, strict=True)]
+    judges = [_read_named_motion(*pair) for pair in zip(options.judge, judging, strict=True)]
     band_hz = options.band_hz or find_predictable_band(logs)
     highest_hz = MAX_RATE_SHARE * min(log.motion.rate_hz for log in (*logs, *judges))
     if not 0.0 < band_hz[0] < band_hz[1] <= highest_hz:
@@ -134,9 +137,9 @@ def identify_table(
     )
 
 
-def _read_named_motion(recording: Recording) -> NamedMotion:
+def _read_named_motion(path: Path, recording: Recording) -> NamedMotion:
     """Return the motion of a recording; InputError if it says nothing of its table."""
-    named = NamedMotion(recording.run, read_table_motion(recording))
+    named = NamedMotion(str(path), read_table_motion(recording))
     check_motion(named)
     return named
 
