@@ -6,6 +6,7 @@ it runs in a process of its own, so that a library that fails on a damaged file 
 InputError. A refusal says what the file is, then what is wrong.
 """
 
+import re
 from dataclasses import replace
 from importlib import import_module
 from io import StringIO
@@ -46,7 +47,13 @@ OTHER_SIGNATURES = {  # what a file is that is not read
     b"\x89PNG": "a PNG image", b"%PDF": "a PDF document", b"\xd0\xcf\x11\xe0": "an old Excel file",
     b"PK": "a ZIP archive", b"\x89HDF": "an HDF5 file", b"\x1f\x8b": "a gzip archive",
     b"PAR1": "a Parquet file", b"TDSm": "a LabVIEW TDMS file", b"MATLAB": "a MATLAB file",
-    b"RIFF": "a WAV sound file",
+    b"RIFF": "a WAV sound file", b"\x93NUMPY": "an array of numpy (.npy), to be saved as .npz",
+    b"\x80": "a pickle of Python, which is never loaded", b"ARROW1": "an Arrow or Feather file",
+    b"SQLite format 3": "an SQLite database",
+}  # fmt: skip
+OTHER_TEXTS = {  # what a text is that is not read, by its first characters
+    rb"\s*<(!doctype html|html)": "an HTML page", rb"\s*<\?xml": "an XML file",
+    rb"\s*(\{\s*[\"}]|\[\s*[\[{])": "a JSON file", rb"\{\\rtf": "an RTF document",
 }  # fmt: skip
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 SNIFF_BYTES = 4096
@@ -101,10 +108,14 @@ def _scan_text(path: Path, start: bytes) -> ForeignTable:
             "empty", where=path, remedy="give a table with a header and one row per sample"
         )
     encodings = _list_encodings(start)
-    if b"\0" in start and encodings != ("utf-16",):
-        kinds = (kind for mark, kind in OTHER_SIGNATURES.items() if start.startswith(mark))
+    is_binary = b"\0" in start and encodings != ("utf-16",)
+    kinds = [
+        kind for mark, kind in OTHER_SIGNATURES.items() if start.startswith(mark) and is_binary
+    ]
+    kinds += [kind for mark, kind in OTHER_TEXTS.items() if re.match(mark, start, re.IGNORECASE)]
+    if is_binary or kinds:
         raise InputError(
-            next(kinds, "a binary file"),
+            next(iter(kinds), "a binary file"),
             where=path,
             allowed=f"text tables, or files that end in {', '.join(FORMATS)}",
         )

@@ -13,7 +13,13 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.errors import InputError
-from table_io.formats.layout import ClockReader, TableLayout, is_number, start_at_zero
+from table_io.formats.layout import (
+    ClockReader,
+    TableLayout,
+    is_number,
+    parse_number,
+    start_at_zero,
+)
 from table_io.formats.table import ForeignTable, make_column
 
 MAX_QUOTED_CHARS = 40  # of a cell in a message
@@ -29,7 +35,7 @@ class _CellReader:
         self._has_commas = layout.has_decimal_commas
         self._has_spare = bool(layout.spare)
         self._converters: list[Callable[[str], float]] = [
-            ClockReader() if kind == "c" else float for kind in layout.kinds
+            ClockReader() if kind == "c" else parse_number for kind in layout.kinds
         ]
         self.values = array("d")
         self.row_numbers = array("q")

@@ -20,8 +20,13 @@ COMMENT_MARKS = "#%!/;*'"
 CONVERTED_MARK = "# variable "  # begins the remark above the columns of a converted record
 MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which cells are text
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+FORTRAN = re.compile(r"\s*[-+]?\d*\.?\d*[dD][-+]?\d+\s*")
+ROW_WORDS = ("TS", "RN")  # units of a time stamp and of a row number, in loggers of Campbell
+# Line below the units of those loggers: how the samples of a column were reduced.
+REDUCTIONS = {"", "Smp", "Avg", "Tot", "Max", "Min", "Std"}
 UNIT_LINE = re.compile(r"\W*units?\s*[:=]\s*(\S+)", re.IGNORECASE)
-DAY_S = 86400.0
+HOUR_S, DAY_S = 3600.0, 86400.0
+MINUTES = re.compile(r"(\d\d?):(\d\d[.,]\d+)")  # and seconds, as spreadsheets show short times
 CLOCK = re.compile(
     r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+)?"
     r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+)?))? ?([AP]M)?(Z|[-+]\d\d:?\d\d)?",
@@ -138,10 +143,13 @@ def _find_names(
     ):
         place -= 1
     names = _fit_names(rows[above[place]], width) if above else ()
+    if place > 0 and names and {*names} <= REDUCTIONS:
+        place -= 1
+        names = _fit_names(rows[above[place]], width)
     if not names:
         return (), units, above
     rest = above[:place]
-    if all(not name or is_unit(name) for name in names) and any(names):
+    if all(not n or is_unit(n) or n in ROW_WORDS for n in names) and any(map(is_unit, names)):
         units = tuple(normalize_unit(name) for name in names[:width])
         names = _fit_names(rows[rest[-1]], width) if rest else ()
         rest = rest[:-1] if names else rest
@@ -189,26 +197,35 @@ def _find_kind(cell: str, commas: bool) -> str:
         return " "
     if is_number(text.replace(",", ".") if commas else text):
         return "n"
-    return "c" if CLOCK.fullmatch(text) else "t"
+    return "c" if CLOCK.fullmatch(text) or MINUTES.fullmatch(text) else "t"
 
 
 def is_number(cell: str) -> bool:
     """Return True if a cell of a table is a number, with a decimal point if any."""
     try:
-        float(cell)
+        parse_number(cell)
     except ValueError:
         return False
     return True
 
 
+def parse_number(cell: str) -> float:
+    """Return the number of a cell, also with an exponent of Fortran (1.0D-03); else ValueError."""
+    try:
+        return float(cell)
+    except ValueError:
+        if not FORTRAN.fullmatch(cell):
+            raise
+        return float(cell.upper().replace("D", "E"))
+
+
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
-    """Return True if numbers have decimal commas, and none outside of remarks a decimal point."""
+    """Return True if most numbers outside of remarks that have a decimal sign have a comma."""
     filled = [[cell.strip() for cell in row if cell.strip()] for row in rows]
     numbers = [row for row in filled if all(is_number(cell.replace(",", ".", 1)) for cell in row)]
     cells = [cell for row in (numbers if any(numbers) else filled) for cell in row]
-    if any("." in cell and is_number(cell) for cell in cells):
-        return False
-    return any(DECIMAL_COMMA.fullmatch(cell) for cell in cells)
+    points = sum("." in cell and is_number(cell) for cell in cells)
+    return sum(DECIMAL_COMMA.fullmatch(cell) is not None for cell in cells) > points
 
 
 class ClockReader:
@@ -221,6 +238,8 @@ class ClockReader:
     def __call__(self, cell: str) -> float:
         """Return the time of a cell in s; NaN if it is empty, ValueError if it is no time."""
         text = cell.strip()
+        if short := MINUTES.fullmatch(text):
+            return 60.0 * int(short[1]) + float(short[2].replace(",", "."))
         match = CLOCK.fullmatch(text)
         if match is None:
             if text:
@@ -245,7 +264,9 @@ class ClockReader:
 
 
 def start_at_zero(times: Float1D) -> Float1D:
-    """Return times of day in s from the first one, (row,), also where they pass midnight."""
-    passed = np.cumsum(np.diff(times, prepend=times[0]) < -0.5 * DAY_S)
-    from_first: Float1D = times + DAY_S * passed - times[0]
+    """Return times of day, or of an hour, in s from the first one, (row,), also where they pass
+    midnight, or the hour."""
+    whole_s = HOUR_S if np.nanmax(times) < HOUR_S else DAY_S
+    passed = np.cumsum(np.diff(times, prepend=times[0]) < -0.5 * whole_s)
+    from_first: Float1D = times + whole_s * passed - times[0]
     return np.round(from_first, 9)

@@ -102,7 +102,7 @@ def _read_segment(
         if name not in part.columns:  # no numbers, or two channels of this name
             continue
         unit, size_text, start_text, interval_text = (
-            (keys.get(key, []) + [""] * len(channels))[k].replace(",", ".")
+            _list_cells(keys.get(key, []), len(channels))[k].replace(",", ".")
             for key in ("Y_Unit_Label", "Samples", "X0", "Delta_X")
         )
         size = int(size_text) if size_text.isdigit() else part.columns[name].size
@@ -119,3 +119,9 @@ def _read_segment(
             values.size, (k + 1,), unit, rate_hz, start_s, clock, values=values
         )
     return columns
+
+
+def _list_cells(cells: list[str], count: int) -> list[str]:
+    """Return the cells of a header line, one for each channel; those of X columns are empty."""
+    filled = [cell for cell in cells if cell]
+    return filled if len(filled) == count else [*cells, *[""] * count]

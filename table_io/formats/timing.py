@@ -70,6 +70,17 @@ def find_time_column(table: ForeignTable, names: Sequence[str]) -> str:
     return ""
 
 
+def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
+    """Return what is wrong with a column that is one of times by its name, "" without one."""
+    for name in names:
+        if find_quantity(name, table.columns[name].unit) == "time":
+            try:
+                _measure_gaps(table.read_column(name), table)
+            except InputError as error:
+                return f"column {name!r}: {error.where.rpartition(': ')[2]}: {error.problem}"
+    return ""
+
+
 def judge_time_unit(table: ForeignTable, name: str, stated_hz: float | None = None) -> TimeUnit:
     """Return the unit of a column of times: as stated, or the only one that is plausible.
 

@@ -84,3 +84,21 @@ def test_import_of_a_reversed_force_asks_for_its_sign(tmp_path: Path) -> None:
     import_with(trusted="true")  # it is imported, but fitted by nobody
     with raises_input_error(where=log, problem="reversed"):
         identify([log])
+
+
+@pytest.mark.parametrize("rate_hz", [0.1, 1.0, 1.3, 20_000.0, 1e6])
+def test_import_at_a_rate_within_the_limits_is_a_log_or_names_the_rate(
+    tmp_path: Path, rate_hz: float
+) -> None:
+    u, force = make_component()
+    u[:300] = force[:300] = 0.0
+    table, log = tmp_path / "a.csv", tmp_path / "a.mcap"
+    columns = np.array([np.arange(u.size) / rate_hz, u, force]).T
+    header = "time (s),disp (m),force (N)"
+    np.savetxt(table, columns, "%.12g", ",", header=header, comments="")
+    if rate_hz < 1.28:
+        with raises_input_error(where=table, problem="samples per second", allowed="1.28 Hz"):
+            import_table(table, log, ImportOptions(accept=True))
+        return
+    import_table(table, log, ImportOptions(accept=True))
+    assert read_recording(log).start.rate_hz == pytest.approx(rate_hz, rel=1e-6)

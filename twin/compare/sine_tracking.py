@@ -136,7 +136,7 @@ def _fit_sine(signal: Float1D, sample: float, f: float) -> _SineFit | None:
     a, b = coefficients[:2]
     amplitude = float(np.hypot(a, b))
     rest = float(np.sqrt(weight @ (x - coefficients @ basis) ** 2 / weight.sum()))
-    if not rest <= MAX_RESIDUAL_RATIO * amplitude:
+    if amplitude == 0.0 or not rest <= MAX_RESIDUAL_RATIO * amplitude:
         return None
     noise = rest / amplitude * float(np.sqrt(2 * (weight @ weight))) / weight.sum() / (2 * np.pi)
     f += float(a * coefficients[4] - b * coefficients[3]) / amplitude**2 / half / (2 * np.pi)

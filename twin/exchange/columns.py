@@ -244,8 +244,8 @@ def read_samples(
     samples = ImportedSamples(rate, index, channels, (*table.notes, *notes), labels)
     if not (table.texts or labels):  # an export of ours keeps every bit
         samples = _judge_quality(samples, table, sources)
-    warnings = _check_plausibility(table, sources, samples.channels, known, rate)
-    samples = replace(samples, notes=(*samples.notes, *warnings))
+    warnings, absurd = _check_plausibility(table, sources, samples.channels, known, rate)
+    samples = replace(samples, notes=(*samples.notes, *warnings), doubts=(*samples.doubts, *absurd))
     return condition_samples(samples, column_map) if column_map is not None else samples
 
 
@@ -466,11 +466,16 @@ def _check_plausibility(
     channels: dict[str, Float1D],
     known: ImportColumns,
     rate_hz: float,
-) -> list[str]:
-    """Return warnings of absurd numbers in stated units; InputError where no unit is stated."""
+) -> tuple[list[str], list[ChannelDoubt]]:
+    """Return (warnings, doubts) of absurd numbers in stated units; InputError where none is."""
     units = {name: known.recorded_unit(name) for name in channels}
-    warnings = []
-    channels = {name: values for name, values in channels.items() if name in sources}
+    warnings: list[str] = []
+    doubts: list[ChannelDoubt] = []
+    channels = {
+        name: values
+        for name, values in channels.items()
+        if name in sources and not sources[name].trusted
+    }
     for implausible in list_implausible(channels, units, rate_hz):
         unstated = [
             sources[name].column
@@ -490,7 +495,11 @@ def _check_plausibility(
                 remedy="state unit = ... in a --columns file, also if the numbers are right",
             )
         warnings.append(f"warning: {implausible.problem}; check the units in the map")
-    return warnings
+        if len(implausible.channels) == 1 and not implausible.is_possible:
+            doubts.append(
+                ChannelDoubt("unit", implausible.channels, implausible.problem, "correct its unit")
+            )
+    return warnings, doubts
 
 
 def condition_samples(samples: ImportedSamples, column_map: ColumnMap) -> ImportedSamples:

@@ -74,7 +74,8 @@ damping_n_s_m = {damping!r}
 bumper_stiffness_n_m = 1.0
 bumper_damping_n_s_m = 0.0
 """
-MAX_PLACEHOLDER_HZ, PLACEHOLDER_DAMPING = 1.0, 0.05
+MIN_PLACEHOLDER_HZ, MAX_PLACEHOLDER_HZ = 0.01, 1.0  # the least that a sweep may have
+PLACEHOLDER_DAMPING = 0.05
 SAMPLES_PER_CYCLE = 128  # of the placeholder; a power of two, so that no rate is rounded below 100
 
 
@@ -376,6 +377,13 @@ def _build_placeholder(
 ) -> RunConfig:
     """Build the run config of a log whose specimen is unknown, but for its mass if it is given."""
     hz = min(MAX_PLACEHOLDER_HZ, rate_hz / SAMPLES_PER_CYCLE)
+    if hz < MIN_PLACEHOLDER_HZ:
+        raise InputError(
+            f"{table.kind} with {rate_hz:g} samples per second, too few for a log",
+            where=table.path,
+            allowed=f"{SAMPLES_PER_CYCLE * MIN_PLACEHOLDER_HZ:g} Hz or more",
+            remedy="resample the table; or if its times are not in s, state their unit",
+        )
     mass = 1.0 if mass_kg is None else mass_kg
     omega = 2.0 * math.pi * hz
     cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)

@@ -18,6 +18,7 @@ from table_io.formats.timing import (
     MAX_INTERVAL_ERROR,
     SAMPLE_UNIT,
     check_rate,
+    describe_unusable_times,
     find_time_column,
     judge_time_unit,
 )
@@ -179,7 +180,8 @@ def propose_map(
     counts_samples = bool(columns) and columns[0].unit == SAMPLE_UNIT
     rate_hz = table.facts.get("rate_hz") if counts_samples or not has_time else None
     if not has_time and rate_hz is None:
-        questions.append("no times and no sampling rate in the file: state --rate HZ")
+        wrong = describe_unusable_times(table, names)
+        questions.append(f"{wrong or 'no times and no sampling rate in the file'}: state --rate HZ")
     size = table.columns[names[0]].size if names else 0
     for name, column in table.columns.items():
         is_channel = find_quantity(name, column.unit) in CHANNELS_OF

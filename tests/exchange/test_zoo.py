@@ -1,0 +1,297 @@
+"""A zoo of strangers' files: every one is read right, or refused with its true cause.
+
+The heads follow the public manuals and export formats of the recorders that they are named for; the
+samples are ours, a component in a smooth motion at 200 Hz. Nothing may be read wrong in silence.
+"""
+
+import gzip
+import json
+import pickle
+from collections.abc import Callable, Iterable
+from datetime import datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.block import Float1D
+from table_io.errors import InputError
+from table_io.formats import read_table
+from twin.exchange.columns import ColumnMap, ImportedSamples, read_samples
+from twin.exchange.proposal import propose_map
+
+ROW_COUNT = 240
+COUNTS: Float1D = np.arange(ROW_COUNT, dtype=np.float64)
+TIME: Float1D = COUNTS / 200.0
+DISP_MM: Float1D = 10.0 * np.sin(2 * np.pi * 2.5 * TIME) + 2.0 * np.sin(2 * np.pi * 5.83 * TIME)
+FORCE_N: Float1D = 36.0 * DISP_MM + 1.1 * np.gradient(DISP_MM, TIME)
+START = datetime(2026, 3, 28, 23, 59, 59, 500000)
+Rows = Iterable[tuple[float, ...]]
+ROWS = [*zip(TIME.tolist(), DISP_MM.tolist(), FORCE_N.tolist(), strict=True)]
+
+
+def text(
+    head: str, rows: Rows = ROWS, mark: str = ",", digits: str = "{:.7f}", tail: str = ""
+) -> str:
+    """Return a text table below a head; a head that ends in no line feed gets one."""
+    lines = [mark.join(digits.format(value) for value in row) for row in rows]
+    return (head + "\n" if head else "") + "\n".join(lines) + "\n" + tail
+
+
+def comma(content: str) -> str:
+    """Return a table with decimal commas."""
+    return content.replace(".", ",")
+
+
+def with_stamps(head: str, stamp: Callable[[datetime, int], str], mark: str = ",") -> str:
+    """Return a table whose first column is a text for each sample."""
+    lines = [
+        mark.join((stamp(START + timedelta(seconds=t), k), f"{u:.7f}", f"{f:.7f}"))
+        for k, (t, u, f) in enumerate(ROWS)
+    ]
+    return head + "\n" + "\n".join(lines) + "\n"
+
+
+def with_times(head: str, times: Float1D, digits: str = "{:.12g}") -> str:
+    lines = [
+        f"{digits.format(t)},{u:.7f},{f:.7f}"
+        for t, (_, u, f) in zip(times.tolist(), ROWS, strict=True)
+    ]
+    return head + "\n" + "\n".join(lines) + "\n"
+
+
+def with_scales(head: str, disp: float, force: float) -> str:
+    return text(head, ((t, disp * u, force * f) for t, u, f in ROWS), digits="{:.12g}")
+
+
+def lvm(x_columns: str, mark: str = "\t", decimal: str = ".", segments: int = 1) -> str:
+    name = {"\t": "Tab", ",": "Comma"}[mark]
+    lines = [
+        "LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", f"Separator\t{name}",
+        f"Decimal_Separator\t{decimal}", "Multi_Headings\tYes", f"X_Columns\t{x_columns}",
+        "Time_Pref\tRelative", "Date\t2026/03/29", "Time\t01:59:59.5", "***End_of_Header***\t", "",
+    ]  # fmt: skip
+    lines = [line.replace("\t", mark) for line in lines]
+    size = ROW_COUNT // segments
+    for part in range(segments):
+        first = part * size
+        start = 0.0 if x_columns == "No" and part == 0 else TIME[first]
+        head = [
+            ("Channels", "2"), ("Samples", str(size), str(size)),
+            ("Date", "2026/03/29", "2026/03/29"), ("Time", "01:59:59", "01:59:59"),
+            ("Y_Unit_Label", "mm", "N"), ("X_Dimension", "Time", "Time"),
+            ("X0", f"{start:.7E}", f"{start:.7E}"), ("Delta_X", "0.005000", "0.005000"),
+        ]  # fmt: skip
+        if x_columns == "Multi":
+            head = [(head[0]), *((k, a, "", b) for k, a, b in head[1:])]
+        lines += [mark.join(cells) for cells in head] + [f"***End_of_Header***{mark}"]
+        names = ["X_Value", "Displacement", "Force"]
+        if x_columns == "Multi":
+            names = ["X_Value", "Displacement", "X_Value", "Force"]
+        lines.append(mark.join([*names, "Comment"]))
+        for t, u, f in ROWS[first : first + size]:
+            x = "" if x_columns == "No" else f"{t:.6f}"
+            cells = [x, f"{u:.7f}", f"{f:.7f}"]
+            if x_columns == "Multi":
+                cells = [x, f"{u:.7f}", x, f"{f:.7f}"]
+            lines.append(mark.join(cells))
+        lines.append("")
+    joined = "\n".join(lines)
+    return joined.replace(".", ",") if decimal == "," else joined
+
+
+MTS = "MTS793|MPT|ENU|1|2|.|/|:|1|0|0|A\n\nData Acquisition:\tTimed\t\tTime:\t1.2\tSec\t29/03/2026"
+CATMAN = "HBM_CATMANSOFTWARE 5.2\nT - worksheet\nDATUM\t29.03.2026\nNummer der Kanaele\t3"
+TOA5 = '"TOA5","CR6","CR6","1234","CR6.Std.10","CPU:test.CR6","9999","Fast"'
+GOOD: dict[str, str | bytes] = {
+    "plain.csv": text("Time (s),Disp (mm),Force (N)"),
+    "square.csv": text("Time [s],Disp [mm],Force [N]"),
+    "bom.csv": ("\ufeff" + text("Time (s),Disp (mm),Force (N)")).encode(),
+    "utf16.txt": text("Time (s)\tDisp (mm)\tForce (N)", mark="\t").encode("utf-16"),
+    "utf16be.txt": b"\xfe\xff" + text("Time (s),Disp (mm),Force (N)").encode("utf-16-be"),
+    "latin1.csv": comma(text("Prüfzeit [s];Weg [mm];Kraft [N]", mark=";")).encode("cp1252"),
+    "mac.csv": text("Time (s),Disp (mm),Force (N)").replace("\n", "\r"),
+    "dos.csv": text("Time (s),Disp (mm),Force (N)").replace("\n", "\r\n"),
+    "semicolon.csv": text("Time (s);Disp (mm);Force (N)", mark=";"),
+    "german.csv": comma(text("Zeit [s];Weg [mm];Kraft [N]", mark=";")),
+    "tab.txt": text("Time (s)\tDisp (mm)\tForce (N)", mark="\t"),
+    "blanks.dat": text("Time Disp Force\ns mm N", mark="   "),
+    "aligned.txt": text("   t[s]    Disp[mm]     Force[N]", mark="  ", digits="{:14.7f}"),
+    "second_row.csv": text("Time,Disp,Force\ns,mm,N"),
+    "second_row_brackets.csv": text("Time,Disp,Force\n[s],[mm],[N]"),
+    "second_row_parentheses.csv": text("Time,Extension,Load\n(s),(mm),(N)"),
+    "names_below_units.csv": text("Test 17\n\nTime,Disp,Force\ns,mm,N\n"),
+    "trailing.csv": text("Time (s),Disp (mm),Force (N),").replace("\n", ",\n").replace(",,", ","),
+    "quoted_names.csv": text('"Time (s)","Disp (mm)","Force (N)"'),
+    "instron_bluehill.csv": "\n".join(
+        ['"Time","Extension","Load"', '"(s)","(mm)","(N)"']
+        + [f'"{t:.4f}","{u:.7f}","{f:.7f}"' for t, u, f in ROWS]
+    ),
+    "zwick.csv": text('"Prüfzeit";"Weg";"Standardkraft"\n"s";"mm";"N"', mark=";").encode("cp1252"),
+    "mts_testsuite.txt": text(
+        f"{MTS}\nRunning Time\tAxial Displacement\tAxial Force\nSec\tmm\tN", mark="\t"
+    ),
+    "catman.asc": comma(text(f"{CATMAN}\nZeit\tWeg\tKraft\ns\tmm\tN", mark="\t")),
+    "campbell_toa5.dat": with_stamps(
+        f'{TOA5}\n"TIMESTAMP","Disp","Force"\n"TS","mm","N"\n"","Smp","Smp"', lambda d, k: f'"{d}"'
+    ),
+    "dewesoft.csv": text(
+        "File name: run7.dxd\nStart time: 29.03.2026 01:59:59\nSample rate: 200 Hz\n\n"
+        "Time (s),Disp (mm),Force (N)"
+    ),
+    "polytec.txt": text(
+        "Source File Name:\trun.pvd\nSignal:\tAnalog\n\nTime\tDisplacement\tForce\n"
+        "[ s ]\t[ mm ]\t[ N ]", mark="\t",
+    ),
+    "phyphox.csv": text('"Time (s)","Displacement (mm)","Force (N)"', digits="{:.9E}"),
+    "pandas_index.csv": text(
+        ",Time (s),Disp (mm),Force (N)", ((k, *row) for k, row in enumerate(ROWS)), digits="{:.9g}"
+    ),
+    "r_row_names.csv": "\n".join(
+        ['"","Time (s)","Disp (mm)","Force (N)"']
+        + [f'"{k + 1}",{t:.4f},{u:.7f},{f:.7f}' for k, (t, u, f) in enumerate(ROWS)]
+    ),
+    "numpy_savetxt.txt": text("# Time (s) Disp (mm) Force (N)", mark=" ", digits="{:.18e}"),
+    "percent.txt": text("% Time (s), Disp (mm), Force (N)", mark=", "),
+    "sep_hint.csv": text("sep=;\nTime (s);Disp (mm);Force (N)", mark=";"),
+    "footer.csv": text("Time (s),Disp (mm),Force (N)", tail="End of data\n"),
+    "comments.csv": text("Time (s),Disp (mm),Force (N)").replace("\n0.5", "\n# mark\n0.5", 1),
+    "status.csv": "\n".join(
+        ["Time (s),Status,Disp (mm),Force (N)"]
+        + [f"{t:.4f},OK,{u:.7f},{f:.7f}" for t, u, f in ROWS]
+    ),
+    "spare_name.csv": text("Time (s),Disp (mm),Force (N),remark"),
+    "twice_alike.csv": text(
+        "Time (s),Disp (mm),Disp (mm),Force (N)", ((t, u, u, f) for t, u, f in ROWS)
+    ),
+    "empty_rows.csv": text("Time (s),Disp (mm),Force (N)", tail=",,\n,,\n"),
+    "micrometre.csv": with_scales("Time (s),Disp (µm),Force (kN)", 1e3, 1e-3).encode(),
+    "micro_cp1252.csv": with_scales("Time (s),Disp (µm),Force (kN)", 1e3, 1e-3).encode("cp1252"),
+    "inch_kip.csv": with_scales("Time (sec),Disp (in),Force (kips)", 1 / 25.4, 1 / 4448.2216152605),
+    "pound.csv": with_scales("Time (sec),Stroke (inch),Load (lbs)", 1 / 25.4, 1 / 4.4482216152605),
+    "kgf.csv": with_scales("Time (s),Disp (cm),Force (kgf)", 0.1, 1 / 9.80665),
+    "ms.csv": with_times("Time (ms),Disp (mm),Force (N)", 1e3 * TIME),
+    "minutes.csv": with_times("Time [min],Disp [mm],Force [N]", TIME / 60),
+    "hours.csv": with_times("Time [h],Disp [mm],Force [N]", TIME / 3600),
+    "epoch.csv": with_times("Timestamp,Disp (mm),Force (N)", 1774742399.5 + TIME, "{:.16g}"),
+    "epoch_ms.csv": with_times("Time,Disp (mm),Force (N)", 1774742399500 + 1e3 * TIME, "{:.16g}"),
+    "epoch_ns.csv": with_times("Time,Disp (mm),Force (N)", 1.7747423995e18 + 1e9 * TIME, "{:.0f}"),
+    "serial.csv": with_times("Time,Disp (mm),Force (N)", 46109.99999 + TIME / 86400, "{:.16g}"),
+    "iso.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: d.isoformat()),
+    "iso_z.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d.isoformat()}Z"),
+    "iso_zone.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d.isoformat()}+01:00"),
+    "clock.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d:%H:%M:%S.%f}"),
+    "german_date.csv": with_stamps(
+        "Zeit;Weg [mm];Kraft [N]", lambda d, k: f"{d:%d.%m.%Y %H:%M:%S.%f}", ";"
+    ),
+    "us_date.csv": with_stamps(
+        "Time,Disp (mm),Force (N)", lambda d, k: f"{d:%m/%d/%Y %I:%M:%S.%f %p}"
+    ),
+    "minutes_seconds.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d:%M:%S.%f}"),
+    "no_times.csv": text(
+        "Sampling rate: 200 Hz\nDisp (mm),Force (N)", ((u, f) for _, u, f in ROWS)
+    ),
+    "interval.csv": text("dt = 0.005 s\nDisp (mm),Force (N)", ((u, f) for _, u, f in ROWS)),
+    "lost.csv": text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", ""),
+    "lost_nan.csv": text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "NaN"),
+    "fortran.dat": text("Time[s] Disp[mm] Force[N]", mark="  ", digits="{:.9E}").replace("E", "D")
+    .replace("Disp", "Disp"),
+    "one.lvm": lvm("One"), "no.lvm": lvm("No"), "multi.lvm": lvm("Multi"),
+    "comma.lvm": lvm("One", mark=","), "decimal.lvm": lvm("One", decimal=","),
+    "segments.lvm": lvm("One", segments=3), "segments_no.lvm": lvm("No", segments=2),
+}  # fmt: skip
+BAD: dict[str, tuple[str | bytes, str]] = {
+    "empty.csv": (b"", "empty"),
+    "blank.csv": (b"\n \n", "empty"),
+    "only_head.csv": ("Time (s),Disp (mm),Force (N)\n", "no samples"),
+    "image.csv": (b"\x89PNG\r\n\x1a\n" + bytes(99), "PNG image"),
+    "paper.csv": (b"%PDF-1.7\n" + bytes(99), "PDF document"),
+    "sound.csv": (b"RIFF\0\0\0\0WAVE" + bytes(99), "sound"),
+    "old.xls": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(99), "old Excel"),
+    "packed.csv": (gzip.compress(text("Time (s),Disp (mm)").encode()), "gzip"),
+    "page.csv": ("<!DOCTYPE html>\n<html><body>Not found</body></html>\n", "HTML"),
+    "data.xml": ("<?xml version='1.0'?>\n<run><x>1</x></run>\n", "XML"),
+    "data.json": (json.dumps({"time": TIME.tolist(), "disp": DISP_MM.tolist()}), "JSON"),
+    "data.pkl": (pickle.dumps({"t": TIME}), "pickle"),
+    "data.npy": (b"\x93NUMPY\x01\x00" + bytes(120), "numpy"),
+    "data.arrow": (b"ARROW1\0\0" + bytes(120), "Arrow"),
+    "mixed.csv": (
+        comma(text("Time;Disp;Force\ns;mm;N", mark=";")).replace("\n0,5", "\n0.5", 1), "decimal"
+    ),
+    "touching.dat": (
+        text("Time[s] Disp[mm] Force[N]", mark=" ", digits="{:.4f}").replace(" -", "-"), "cells"
+    ),
+    "infinite.csv": (
+        text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "inf"), "infinite"
+    ),
+    "footer_sums.csv": (
+        text("Time (s),Disp (mm),Force (N)", tail="\nMaximum,11.9,430\n"), "'Maximum'"
+    ),
+    "overflow.csv": (
+        text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "OVERFLOW"), "OVERFLOW"
+    ),
+    "backwards.csv": (text("Time (s),Disp (mm),Force (N)", reversed(ROWS)), "time"),
+    "twice.csv": (text("Time (s),Disp (mm),Force (N)", [*ROWS, *ROWS]), "time must rise"),
+    "counts.csv": (with_times("No,Disp (mm),Force (N)", 1.0 + COUNTS), "rate"),
+    "sample_numbers.csv": (with_times("Time,Disp (mm),Force (N)", COUNTS), "counts"),
+    "ms_unstated.csv": (with_times("Time,Disp (mm),Force (N)", 1e3 * TIME), "ms"),
+    "days_unstated.csv": (with_times("Time,Disp (mm),Force (N)", TIME / 86400), "day"),
+    "no_rate.csv": (text("Disp (mm),Force (N)", ((u, f) for _, u, f in ROWS)), "rate"),
+    "no_units.csv": (text("Time (s),Disp,Force"), "unit is not stated"),
+    "no_names.csv": (text(""), "no column is known"),
+    "volts.csv": (text("Time,Channel A,Channel B\n(s),(V),(V)"), "no column is known"),
+    "two_rates.csv": (text("Sampling rate: 100 Hz\nTime (s),Disp (mm),Force (N)"), "100 Hz"),
+    "twice_different.csv": (
+        text("Time (s),Force (N),Force (N)"), "2 columns have this name"
+    ),
+    "reversed.csv": (with_scales("Time (s),Disp (mm),Force (N)", 1.0, -1.0), "reversed"),
+    "metres.csv": (with_scales("Time (s),Disp (m),Force (N)", 35.0, 1.0), "m"),
+    "smc.smc": ("2 CORRECTED ACCELEROGRAM\n" + "1 2 3\n" * 40, "SMC"),
+    "empty.lvm": ("LabVIEW Measurement\t\nWriter_Version\t2\n***End_of_Header***\n", "no segment"),
+    "not.tdms": (b"hello" * 30, "not a LabVIEW TDMS file"),
+    "not.parquet": (b"hello" * 30, "not a Parquet file"),
+    "not.mat": (b"hello" * 60, ""),
+}  # fmt: skip
+
+
+def read_stranger(path: Path) -> ImportedSamples:
+    """Return the samples by the proposed map; InputError with the cause or the open questions."""
+    table = read_table(path)
+    proposal = propose_map(table)
+    if proposal.questions:
+        raise InputError("; ".join([*proposal.questions, *proposal.dropped]), where=path)
+    column_map = ColumnMap.model_validate(proposal.to_map().model_dump(exclude_unset=True))
+    samples = read_samples(table, column_map)
+    if samples.doubts:
+        raise InputError("; ".join(doubt.problem for doubt in samples.doubts), where=path)
+    return samples
+
+
+def check(samples: ImportedSamples, lost: int = 0) -> None:
+    assert samples.rate_hz == pytest.approx(200.0, rel=1e-6)
+    assert samples.index.tolist() == list(range(ROW_COUNT))
+    expected = {"rel_disp_m": 1e-3 * DISP_MM, "damper_force_n": FORCE_N}
+    for name, values in expected.items():
+        read = samples.channels[name]
+        good = np.isfinite(read)
+        assert good.sum() >= ROW_COUNT - lost, name
+        np.testing.assert_allclose(read[good], values[good], rtol=1e-5, atol=1e-6, err_msg=name)
+
+
+def write(path: Path, content: str | bytes) -> Path:
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_a_stranger_is_read_right(tmp_path: Path, name: str) -> None:
+    check(read_stranger(write(tmp_path / name, GOOD[name])), lost=name.startswith("lost"))
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_stranger_is_refused_with_its_true_cause(tmp_path: Path, name: str) -> None:
+    content, cause = BAD[name]
+    with pytest.raises(InputError) as caught:
+        read_stranger(write(tmp_path / name, content))
+    assert cause in str(caught.value)
+    assert "sweep." not in str(caught.value)
