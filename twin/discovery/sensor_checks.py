@@ -28,11 +28,14 @@ MAX_HUM_RATIO = 5.0  # rms over that of the noise
 MAX_CORNER_HZ = 100.0  # below it 1/f noise exceeds white noise; 1 Hz is usual, seen to a factor
 MAX_RESOLUTION_SHARE = 0.01  # of the rms of the channel in motion
 MIN_FILTER_HZ = 125.0  # an impact on a stiff bumper has harmonics up to there
+FILTER_SHARE = 0.125  # of the rate, from which an anti-alias filter of a slow recording is its due
 MAX_GAIN_ERROR = 0.02  # two calibrations of 1 %, or the slope of a laser for small motions
 MAX_LAG_S = 4e-4  # multiplexed converters and unequal filters stay below it
 MAX_LOW_CUT_HZ = 0.4  # 8 % at 1 Hz
 MAX_REMAINDER_SHARE, MIN_REMAINDER_RATIO = 0.02, 3.0  # of the motion; over the noise
-MIN_RESONANCE_HZ = 400.0  # of an accelerometer on its bracket
+# Of an accelerometer on its bracket; beyond the Nyquist frequency none can be told from a gain that
+# rises with frequency.
+MIN_RESONANCE_HZ = 400.0
 MAX_SHARE_ERROR = 0.05  # of the force, off an equal division between the cells of a side
 MAX_PLATE_SHARE = 0.015  # of the mass of the specimen, in front of the cells of a side
 MAX_GAP_ERROR_M = 1.5e-4  # a feeler gauge reads to 0.05 mm
@@ -90,6 +93,7 @@ def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tupl
 
 
 def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
+    rate_hz = signals.grid.rate_hz
     for channel, noise in signals.rest_noise.items():
         rms, motion = max(noise.rms, np.finfo(float).tiny), signals.channel_rms(channel)
 
@@ -100,10 +104,11 @@ def _check_noise(signals: LogSignals) -> Iterator[SensorCheck]:
             ("hum", noise.hum_rms / rms, MAX_HUM_RATIO, ""),
             ("one_over_f", noise.corner_hz, MAX_CORNER_HZ, "Hz"),
             ("resolution", step / motion if motion else 0.0, MAX_RESOLUTION_SHARE, ""),
-            ("filter", noise.filter_hz, MIN_FILTER_HZ, "Hz"),
+            ("filter", noise.filter_hz, min(MIN_FILTER_HZ, FILTER_SHARE * rate_hz), "Hz"),
         ]
         for kind, value, limit, unit in rows:
-            if math.isfinite(value):
+            is_measured = kind != "one_over_f" or value <= 0.5 * rate_hz
+            if math.isfinite(value) and is_measured:
                 yield SensorCheck(signals.name, kind, (channel,), value, value, value, limit, unit)
 
 
@@ -265,7 +270,7 @@ def _check_fitted(residuals: LogResiduals, fit: FitResult) -> Iterator[SensorChe
             )
             yield SensorCheck(
                 signals.name, "resonance", (nuisance.place,), frequency, low, high,
-                MIN_RESONANCE_HZ, "Hz",
+                min(MIN_RESONANCE_HZ, 0.5 * signals.grid.rate_hz), "Hz",
             )  # fmt: skip
     common, sd = fit.values.get(GapKey(number), 0.0), fit.std_errors.get(GapKey(number), 0.0)
     for side, sign, gap in zip(("right", "left"), (1.0, -1.0), signals.gaps_m, strict=True):
