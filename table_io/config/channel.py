@@ -15,12 +15,14 @@ table gives: a sum of canonical channels times factors, plus `constant`, in SI.
 
 import re
 import tomllib
+from collections.abc import Iterable
 from typing import Literal, NamedTuple
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
 from table_io.config.base import ConfigModel, Finite
+from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 
 NAME_PATTERN = r"[a-z][a-z0-9]*(_[a-z0-9]+)+"
@@ -28,6 +30,17 @@ MAX_NAME_LENGTH = 60
 RESERVED_NAMES = ("level_m_s2",)  # column of an export: level of the step
 RESERVED_PREFIX = "twin_"  # of the columns of the twin in an export
 CONSTANT = "constant"  # key of `simulated`
+
+
+# Channels that a laboratory's table may have, with quantity, body, direction and meaning. An import
+# declares them where a file has columns of these names.
+TABLE_CHANNELS = {
+    "actuator_disp_m": ("displacement", "other", "right", "Stroke of the actuator."),
+    "delta_pressure_pa": ("pressure", "other", "", "Pressure difference over the piston."),
+    "valve_command_v": ("voltage", "other", "", "Command of the servo valve."),
+    "table_force_n": ("force", "table", "compression", "Force of the actuator on the table."),
+}
+SPECIMEN_ACCELERATION = re.compile(r"specimen_acc_[a-z0-9_]+_m_s2")  # of a point of the specimen
 
 
 class Quantity(NamedTuple):
@@ -152,6 +165,31 @@ class ChannelConfig(ConfigModel):
     def channel(self) -> Channel:
         """Entry of this channel in the registry."""
         return Channel(self.name, self.unit, self.positive, self.meaning, self.quantity, self.body)
+
+
+def is_table_channel(name: str) -> bool:
+    """Return True for a channel of a table or its specimen that a twin of the table may use."""
+    return name in TABLE_CHANNELS or SPECIMEN_ACCELERATION.fullmatch(name) is not None
+
+
+def declare_table_channels(rig_toml: str, columns: Iterable[str]) -> str:
+    """Return a rig file that also declares the channels of a table among the columns of a file."""
+    known = read_channels(rig_toml)
+    for name in columns:
+        if is_table_channel(name) and name not in known:
+            point = ("acceleration", "other", "right", "Acceleration of a point of the specimen.")
+            quantity, body, positive, meaning = TABLE_CHANNELS.get(name, point)
+            declared = ChannelConfig(
+                quantity=quantity,
+                unit=QUANTITIES[quantity].unit,
+                name=name,
+                body=body,
+                positive=positive,
+                meaning=meaning,
+            )
+            table = format_toml({"channels": [declared.model_dump(exclude_none=True)]})
+            rig_toml = f"{rig_toml.rstrip()}\n{table}"
+    return rig_toml
 
 
 def read_channels(rig_toml: str) -> dict[str, Channel]:

@@ -11,11 +11,18 @@ from table_io.sim.config import SimulatedTableConfig
 from table_io.sim.plant import SIGNALS, Plant
 from table_io.sim.simulated_table import build_plant
 from tests.builders.rigs import read_rig
+from twin.earthquakes.table_identification import (
+    RehearsalProblem,
+    TableIdentification,
+    TableRehearsal,
+    fit_basic_twin,
+)
 
 RATE_HZ = 1000.0
 RIG = read_rig("hydraulic")
 TABLE = RIG.require_section("simulated", SimulatedTableConfig)
 SPECIMEN_KG = 550.0
+STALL_N = 42_000.0
 
 
 def build_rig(friction_n: float = 500.0, gap_mm: float = math.inf) -> Plant:
@@ -47,3 +54,9 @@ def make_random_motion(
     acceleration = np.gradient(np.gradient(motion)) * RATE_HZ**2
     scaled: Float1D = motion * rms_m_s2 / acceleration.std()
     return scaled
+
+
+def identify(rehearsal: TableRehearsal) -> TableIdentification:
+    """Return the hydraulic twin of a rehearsal, without further effects."""
+    problem = RehearsalProblem.from_rehearsal(rehearsal, TABLE.moving_mass_kg, STALL_N)
+    return fit_basic_twin(problem).to_identification()

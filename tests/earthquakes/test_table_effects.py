@@ -19,8 +19,10 @@ from table_io.sim.hydraulic_table import make_coefficients
 from tests.earthquakes.hydraulic_rig import (
     RATE_HZ,
     SPECIMEN_KG,
+    STALL_N,
     TABLE,
     build_rig,
+    identify,
     make_random_motion,
     play,
 )
@@ -42,11 +44,10 @@ from twin.earthquakes.table_identification import (
     TableRehearsal,
     fit_basic_twin,
     fit_table,
-    fit_table_twin,
 )
 from twin.earthquakes.table_model import TableModel, TableParameters
 
-MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
+MASS_KG = TABLE.moving_mass_kg
 BASIC = TableParameters(
     pressure_feedback_s=0.003, friction_n=500.0, static_excess_n=150.0, stick_damping_n_s_m=2e4,
     viscous_n_s_m=500.0, frame_ratio=0.05, stall_force_n=STALL_N,
@@ -400,7 +401,7 @@ def test_the_fit_begins_where_it_can_reach_the_table() -> None:
         },
         delay_ms=3.5,
     )
-    result = fit_table_twin(record_rehearsal(table), TABLE.moving_mass_kg, 42_000.0)
+    result = identify(record_rehearsal(table))
     assert result.residual < 0.06
     assert result.model.parameters.friction_n == pytest.approx(1465.0, rel=0.05)
     assert result.model.parameters.oil_hz == pytest.approx(21.34, rel=0.03)

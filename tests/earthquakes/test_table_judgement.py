@@ -15,15 +15,18 @@ import pytest
 from scipy import signal
 
 from table_io.block import Float1D
+from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from tests.command_line import call_main
 from twin.earthquakes.drive_computation import compute_command, measure_error
-from twin.earthquakes.result import load_table_twin
+from twin.earthquakes.result import Judgement, load_table_twin
 from twin.earthquakes.table_identification import TableRehearsal
 from twin.earthquakes.table_judgement import (
     NamedMotion,
+    StructureTrial,
     check_motion,
     choose_structure,
+    estimate_with_channels,
     find_predictable_band,
     fit_responses,
     judge_fitted_logs,
@@ -33,6 +36,7 @@ from twin.earthquakes.table_judgement import (
 from twin.earthquakes.table_response import Resonance, ResponseModel, find_delay
 from twin.earthquakes.task import TableTwinOptions, identify_table
 from twin.exchange.import_table import import_table
+from twin.recording.reader import read_recording
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "td3_table"
 RATE_HZ = 200.0
@@ -86,6 +90,15 @@ def fit(*logs: NamedMotion, band_hz: tuple[float, float] = (0.3, 10.0)) -> Respo
     return model
 
 
+def judge_others(
+    chosen: StructureTrial,
+    trials: list[StructureTrial],
+    logs: list[NamedMotion],
+    band_hz: tuple[float, float],
+) -> Judgement:
+    return judge_other_logs(chosen, trials, logs, prepare_data(logs, band_hz))
+
+
 @pytest.fixture(scope="module")
 def response_fit() -> tuple[list[NamedMotion], ResponseModel]:
     logs = [make_log(seed) for seed in range(3)]
@@ -101,7 +114,7 @@ def test_friction_and_the_resonance_that_it_excites_are_found(
     assert choose_structure(trials).id == model.structure == "friction_resonance"
     assert isinstance(model.resonance, Resonance)
     assert model.resonance.hz == pytest.approx(RING_HZ, rel=0.01)
-    judged = judge_other_logs(choose_structure(trials), trials, [make_log(9)], (0.3, 10.0))
+    judged = judge_others(choose_structure(trials), trials, [make_log(9)], (0.3, 10.0))
     (run,) = judged.runs
     assert run.error.twin < 0.35 * run.error.pure_delay
     assert run.error.twin < 0.5 * run.error.frf
@@ -120,7 +133,7 @@ def test_a_late_table_with_a_gain_gets_the_simplest_structure() -> None:
     assert chosen.model.delay_s == pytest.approx(DELAY_SAMPLES / RATE_HZ, abs=2.5e-4)
     gain = np.abs(chosen.model.frequency_response(np.array([2.0])))[0]
     assert gain == pytest.approx(0.97, abs=0.002)
-    assert judge_other_logs(chosen, trials, [make_log(3, play)], (0.3, 4.0)).explain_refusal() == ""
+    assert judge_others(chosen, trials, [make_log(3, play)], (0.3, 4.0)).explain_refusal() == ""
 
 
 def test_a_response_does_not_depend_on_the_rate(
@@ -173,7 +186,7 @@ def test_a_twin_that_loses_is_refused_with_its_figures() -> None:
     logs = [make_log(1), make_log(2)]
     opposite = make_log(3, lambda command, seed: play_table(command, seed, -FRICTION_M_S2))
     trials = fit_responses(prepare_data(logs, (0.3, 10.0)))
-    judged = judge_other_logs(choose_structure(trials), trials, [opposite], (0.3, 10.0))
+    judged = judge_others(choose_structure(trials), trials, [opposite], (0.3, 10.0))
     (run,) = judged.runs
     assert run.error.twin > 1.5 * run.error.pure_delay
     assert f"run3: error {run.error.twin:.3g}" in judged.explain_refusal()
@@ -327,6 +340,54 @@ def test_the_command_judges_imported_logs_and_writes_what_does_not_lose(tmp_path
         identify_table(TableTwinOptions(tuple(logs), judge=(logs[2],)))
 
 
+def shake_unknown(seed: int) -> NamedMotion:
+    """Return a late table with a motion that no command makes, which another channel measures.
+
+    The channel reads three times its acceleration, 10 ms earlier, and noise.
+    """
+    command = make_command(seed)
+    unknown = 0.1 * make_command(70 + seed)
+    log = name_motion(command, play_table(command, seed, 0.0) + unknown, f"run{seed}")
+    early = np.roll(np.gradient(np.gradient(unknown)) * RATE_HZ**2, -2)
+    noise = 0.01 * early.std() * np.random.default_rng(seed).standard_normal(early.size)
+    return replace(log, channels={"specimen_acc_roof_m_s2": 3.0 * early + noise})
+
+
+def test_an_estimate_with_channels_knows_what_the_command_does_not() -> None:
+    logs, band_hz = [shake_unknown(seed) for seed in range(3)], (0.3, 4.0)
+    data = prepare_data(logs, band_hz)
+    trials = fit_responses(data[:2])
+    judged = judge_other_logs(choose_structure(trials), trials, logs[2:], data[2:])
+    estimate = estimate_with_channels(data[:2], data[2:])
+    assert estimate is not None
+    assert estimate.channels == ("specimen_acc_roof_m_s2",)
+    (error,) = estimate.errors
+    assert error < 0.2 * judged.runs[0].error.twin
+    assert estimate_with_channels(prepare_data([make_log(1)], band_hz), []) is None
+
+
+def test_the_channels_of_a_table_are_known_to_an_import_and_to_the_twin(tmp_path: Path) -> None:
+    log = shake_unknown(1)
+    motion = log.motion
+    names = ("specimen_acc_roof_m_s2", "delta_pressure_pa", "valve_command_v")
+    rows = [np.arange(motion.command_m.size) / RATE_HZ, motion.command_m, motion.displacement_m]
+    rows += [*log.channels.values(), 1e5 * motion.command_m, motion.command_m]
+    file, imported = tmp_path / "run.csv", tmp_path / "run.mcap"
+    header = ",".join(("time_s", "drive_disp_m", "table_disp_m", *names))
+    np.savetxt(file, np.array(rows).T, delimiter=",", header=header, comments="")
+    import_table(file, imported)
+    recording = read_recording(imported)
+    assert set(names) < set(recording.start.channels)
+    units = {
+        name: channel.unit for name, channel in read_channels(recording.start.rig_toml).items()
+    }
+    assert [units[name] for name in names] == ["m/s2", "Pa", "V"]
+    estimate = identify_table(TableTwinOptions(imported)).judgement.estimate
+    assert estimate is not None
+    assert estimate.channels == tuple(sorted(names))
+    assert estimate.errors[0] < 0.05
+
+
 def read_measured_logs() -> list[NamedMotion]:
     """Return the runs of a real servo-hydraulic table with a frame on it."""
     files = sorted(DATA.glob("*.csv.gz"))
@@ -337,22 +398,28 @@ def read_measured_logs() -> list[NamedMotion]:
         with gzip.open(file, "rt") as text:
             rows = np.genfromtxt(text, delimiter=",", skip_header=1)
         table, command = ((1e-3 * (rows[:, k] - rows[0, k])) for k in (1, 8))
+        floors = {f"specimen_acc_{k}_m_s2": 1e-3 * rows[:, k] for k in (3, 4, 5)}
         motion = TableRehearsal(204.8, command, table, 0.0 * table, 0.0 * table, False)
-        logs.append(NamedMotion(file.name, motion))
+        logs.append(NamedMotion(file.name, motion, floors))
     return logs
 
 
 def test_measured_runs_are_predicted_from_their_command_alone() -> None:
     """Each by a twin of the others: the acceleration as issued, the displacement as well."""
     logs, band_hz = read_measured_logs(), (0.3, 10.0)
-    ratios = []
+    ratios, estimates = [], []
     for judge in logs:
         check_motion(judge)
         others = [log for log in logs if log is not judge]
         trials = fit_responses(prepare_data(others, band_hz))
         chosen = choose_structure(trials)
-        (run,) = judge_other_logs(chosen, trials, [judge], band_hz).runs
+        (run,) = judge_others(chosen, trials, [judge], band_hz).runs
         ratios.append(run.error.twin / run.error.pure_delay)
+        estimate = estimate_with_channels(
+            prepare_data(others, band_hz), prepare_data([judge], band_hz)
+        )
+        assert estimate is not None
+        estimates.append(estimate.errors[0] / run.error.pure_delay)
         motion = judge.motion
         predicted = chosen.model.simulate(motion.command_m, motion.rate_hz)[0]
         by_twin, by_command = (
@@ -361,6 +428,7 @@ def test_measured_runs_are_predicted_from_their_command_alone() -> None:
         assert by_twin < by_command
     assert np.median(ratios) < 0.85
     assert max(ratios) < 1.0
+    assert np.median(estimates) < 0.45  # with the accelerations of the floors
 
 
 def test_the_delay_of_measured_runs_lies_within_a_control_period_or_two() -> None:

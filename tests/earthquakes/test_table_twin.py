@@ -12,8 +12,10 @@ from tests.builders.rigs import compute_oil_column_hz
 from tests.earthquakes.hydraulic_rig import (
     RATE_HZ,
     SPECIMEN_KG,
+    STALL_N,
     TABLE,
     build_rig,
+    identify,
     make_random_motion,
     play,
 )
@@ -21,11 +23,10 @@ from twin.earthquakes.drive_computation import compute_command, compute_correcti
 from twin.earthquakes.table_identification import (
     TableIdentification,
     TableRehearsal,
-    fit_table_twin,
 )
 from twin.earthquakes.table_model import TableModel, TableParameters
 
-MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
+MASS_KG = TABLE.moving_mass_kg
 BAND_HZ = 0.3, 18.0
 LINEAR = TableParameters(pressure_feedback_s=0.003, viscous_n_s_m=2e3, frame_ratio=0.05)
 
@@ -42,7 +43,7 @@ def rehearse(friction_n: float, noise: bool = True) -> TableRehearsal:
 
 @pytest.fixture(scope="module", params=[500.0, pytest.param(1500.0, marks=pytest.mark.slow)])
 def identification(request: pytest.FixtureRequest) -> tuple[float, TableIdentification]:
-    return request.param, fit_table_twin(rehearse(request.param), MASS_KG, STALL_N)
+    return request.param, identify(rehearse(request.param))
 
 
 @pytest.mark.parametrize("hz", [0.5, 3.0, 9.0, 14.0, 20.0, 28.0, 35.0])
@@ -112,4 +113,4 @@ def test_what_is_no_rehearsal_is_refused(seconds: float) -> None:
     zeros = np.zeros(round(seconds * RATE_HZ))
     command = zeros if seconds > 10.0 else np.sin(np.arange(zeros.size) / 100.0)
     with pytest.raises(InputError):
-        fit_table_twin(TableRehearsal(RATE_HZ, command, zeros, zeros, zeros), MASS_KG)
+        identify(TableRehearsal(RATE_HZ, command, zeros, zeros, zeros))

@@ -107,6 +107,12 @@ def _print_twin(result: TableTwinResult) -> None:
         errors = (f"{100 * getattr(run.error, name):.3g} %" for name in names)
         runs.add_row(run.log, f"{run.band_hz[0]:g} to {run.band_hz[1]:g}", *errors)
     print_table(console, runs)
+    if estimate := judgement.estimate:
+        figures = ", ".join(f"{100 * error:.3g} %" for error in estimate.errors)
+        print_line(
+            f"with the measured {', '.join(estimate.channels)} the error would be {figures}: an "
+            "estimate of the motion, no prediction"
+        )
 
 
 def _make_parameter_table(identification: TableIdentification, title: str) -> Table:

@@ -52,6 +52,13 @@ class JudgedRun(ConfigModel):
         return best if self.error.twin > limit else ""
 
 
+class ChannelEstimate(ConfigModel):
+    """Errors of an estimate of the table's acceleration from command and further channels."""
+
+    channels: tuple[str, ...] = Field(description="Measured channels that it uses.")
+    errors: tuple[NonNegative, ...] = Field(description="Errors on the runs of the judgement.")
+
+
 class Judgement(ConfigModel):
     """Judgement of a table's twin on data that was not fitted."""
 
@@ -59,6 +66,9 @@ class Judgement(ConfigModel):
     on: str = Field(description="What was left out of the fit.")
     held_out: dict[str, float] = Field(description="Held-out error of each structure.")
     runs: tuple[JudgedRun, ...] = Field(description="Errors by log.")
+    estimate: ChannelEstimate | None = Field(
+        None, description="With measured channels of the table and specimen: no prediction."
+    )
 
     def explain_refusal(self) -> str:
         """Return why the twin is refused, in words; empty if it loses to no baseline."""
@@ -205,7 +215,7 @@ class TableTwinResult:
             }
         elif isinstance(model, ResponseModel):
             text["response"] = _describe_response(model).model_dump(exclude_none=True)
-        text["judgement"] = self.judgement.model_dump()
+        text["judgement"] = self.judgement.model_dump(exclude_none=True)
         text["provenance"] = self.provenance.model_dump()
         return format_toml(text)
 

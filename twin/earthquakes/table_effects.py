@@ -22,16 +22,13 @@ import numpy.typing as npt
 from table_io.block import Float1D, Float2D
 from twin.earthquakes.table_identification import (
     BOUNDS,
-    RehearsalProblem,
     TableFit,
-    TableIdentification,
-    TableRehearsal,
     build_parameters,
     fit_basic_twin,
     fit_table,
-    map_in_threads,
 )
 from twin.earthquakes.table_model import TableParameters
+from twin.system.process_pool import map_in_threads
 
 FOLD_COUNT = 3  # blocks of time are held out by turns
 MAX_EFFECTS = 2
@@ -302,22 +299,6 @@ class EffectDiscovery:
     findings: tuple[EffectFinding, ...]
     gap: float
     closest: RivalEffect | None
-
-
-def fit_table_twin_with_effects(
-    motion: TableRehearsal,
-    mass_kg: float,
-    stall_force_n: float = math.inf,
-    report: Callable[[str], None] = lambda stage: None,
-) -> tuple[TableIdentification, EffectDiscovery]:
-    """Identify the twin of a table with the effects that its rehearsal shows, and say which.
-
-    InputError if the rehearsal is too short or shows no motion.
-    """
-    report("fitting the twin of the table")
-    problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
-    discovery = discover_table_effects(fit_basic_twin(problem), report)
-    return discovery.fit.to_identification(), discovery
 
 
 def discover_table_effects(

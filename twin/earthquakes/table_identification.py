@@ -6,13 +6,10 @@ accelerometer says little, the acceleration above, both as acceleration.
 """
 
 import math
-import os
-from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product
 from types import MappingProxyType
-from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +19,7 @@ from table_io.block import Float1D, Float2D, Int1D
 from table_io.errors import InputError
 from twin.earthquakes.table_model import TableModel, TableParameters
 from twin.earthquakes.table_response import CROSSOVER_HZ
+from twin.system.process_pool import map_in_threads
 
 LOWEST_HZ, HIGHEST_HZ = 0.2, 45.0  # of the fit
 MIN_DURATION_S = 10.0
@@ -63,12 +61,7 @@ MAX_FRAMES = 2  # a mode of the oil column may look like a frame
 ROUGH_EVALUATIONS = 6  # of the fits that only lead to a start
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
-MAX_THREADS = 8
 LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
-
-
-T = TypeVar("T")
-U = TypeVar("U")
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,14 +255,6 @@ class TableFit:
         return step
 
 
-def fit_table_twin(
-    motion: TableRehearsal, mass_kg: float, stall_force_n: float = math.inf
-) -> TableIdentification:
-    """Fit the table's twin to a rehearsal; InputError if that is too short or shows no motion."""
-    problem = RehearsalProblem.from_rehearsal(motion, mass_kg, stall_force_n)
-    return fit_basic_twin(problem).to_identification()
-
-
 def fit_basic_twin(
     problem: RehearsalProblem,
     effect_bounds: Mapping[str, tuple[float, float, float]] = MappingProxyType({}),
@@ -310,12 +295,6 @@ def fit_basic_twin(
     rough = min(fits, key=lambda fit: fit.cost)
     near = fit_table(problem, bounds, rough.scaled_values, tolerance=1e-3)
     return fit_table(problem.with_noise_of(near), bounds, near.scaled_values)
-
-
-def map_in_threads(function: Callable[[T], U], items: Sequence[T]) -> list[U]:
-    """Return a function of each item; simulations release the interpreter's lock."""
-    with ThreadPoolExecutor(min(os.cpu_count() or 1, MAX_THREADS)) as pool:
-        return list(pool.map(function, items))
 
 
 def fit_table(

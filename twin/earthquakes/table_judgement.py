@@ -7,8 +7,8 @@ are fitted with parts of the time left out, and the simplest that is not worse i
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +16,7 @@ from scipy import signal
 
 from table_io.block import Float1D
 from table_io.errors import InputError
-from twin.earthquakes.result import HYDRAULIC, JudgedErrors, JudgedRun, Judgement
+from twin.earthquakes.result import HYDRAULIC, ChannelEstimate, JudgedErrors, JudgedRun, Judgement
 from twin.earthquakes.table_effects import LIBRARY
 from twin.earthquakes.table_identification import (
     BOUNDS,
@@ -28,11 +28,13 @@ from twin.earthquakes.table_identification import (
 )
 from twin.earthquakes.table_model import TableModel
 from twin.earthquakes.table_response import (
+    FRICTION_TERMS,
     STRUCTURES,
     BandProjection,
     ResponseData,
     ResponseModel,
     ResponseRegression,
+    ResponseStructure,
     find_delay,
     find_resonance,
     measure_held_out,
@@ -64,10 +66,11 @@ MAX_ERROR = 1e3  # that is stated: a twin that diverges
 
 @dataclass(frozen=True, eq=False)
 class NamedMotion:
-    """Motion of a table and the name of the log that it is from."""
+    """Motion of a table, the name of the log that it is from, and its further channels."""
 
     log: str
     motion: TableRehearsal
+    channels: Mapping[str, Float1D] = field(default_factory=dict)
 
 
 def check_motion(named: NamedMotion) -> None:
@@ -298,7 +301,7 @@ def prepare_data(logs: Sequence[NamedMotion], band_hz: tuple[float, float]) -> l
         if len(logs) == 1:
             energy = np.cumsum(measured**2)
             part = np.minimum((PART_COUNT * energy / energy[-1]).astype(int), PART_COUNT - 1)
-        data.append(ResponseData(projection, motion.command_m, spectrum, part))
+        data.append(ResponseData(projection, motion.command_m, spectrum, part, log.channels))
     return data
 
 
@@ -392,17 +395,40 @@ def judge_other_logs(
     chosen: StructureTrial,
     trials: Sequence[StructureTrial],
     logs: Sequence[NamedMotion],
-    band_hz: tuple[float, float],
+    data: Sequence[ResponseData],
 ) -> Judgement:
     """Return the judgement of a twin by logs that were not fitted."""
     frf = next(trial for trial in trials if trial.id == "frf")
     runs = []
-    for log, own in zip(logs, prepare_data(logs, band_hz), strict=True):
+    for log, own in zip(logs, data, strict=True):
         left, left_by_frf = (
             own.measured - _predict(trial.model, log.motion, own) for trial in (chosen, frf)
         )
         runs.append(_judge_run(log, own, left, left_by_frf))
     return _build_judgement(chosen, trials, runs, "other logs")
+
+
+def estimate_with_channels(
+    data: Sequence[ResponseData], judges: Sequence[ResponseData]
+) -> ChannelEstimate | None:
+    """Return how well the acceleration follows from command and further measured channels.
+
+    On the judging data, or without any on parts of the fitted one that were left out. These
+    channels are measurements of the motion itself, so that this is no prediction: it says how much
+    of what a twin leaves is the reaction of what stands on the table. None without such channels.
+    """
+    names = set.intersection(*(set(log.channels) for log in (*data, *judges)))
+    if not names:
+        return None
+    channels = tuple(sorted(names))
+    structure = ResponseStructure("estimate", "with channels", (*FRICTION_TERMS, *channels))
+    regression = ResponseRegression.from_data(structure, data, find_delay(data))
+    left = [regression.leave(log) for log in judges] if judges else regression.held_out
+    errors = (
+        _round_error(float(np.linalg.norm(rest) / np.linalg.norm(log.measured)))
+        for rest, log in zip(left, judges or data, strict=True)
+    )
+    return ChannelEstimate(channels=channels, errors=tuple(errors))
 
 
 def _predict(

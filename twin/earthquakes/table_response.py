@@ -14,7 +14,7 @@ twin of it holds for that specimen.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -248,6 +248,9 @@ class ResponseData:
     command_m: Float1D
     measured_spectrum: Complex1D  # of the acceleration in the band, (frequency,)
     part: Int1D  # (row,)
+    channels: Mapping[str, Float1D] = field(
+        default_factory=dict
+    )  # further measured ones, (sample,) each
 
     @cached_property
     def measured(self) -> Float1D:
@@ -256,11 +259,13 @@ class ResponseData:
 
     @cached_property
     def term_spectra(self) -> dict[str, Complex1D]:
-        """Spectra of the inputs in the band, (frequency,) each."""
+        """Spectra of the inputs and further channels in the band, (frequency,) each."""
         projection = self.projection
         extended = extend_motion(self.command_m, projection.rate_hz)
-        terms = compute_terms(extended, projection.rate_hz, tuple(TERMS))
-        return {name: spectrum[projection.used] for name, spectrum in terms.items()}
+        spectra = compute_terms(extended, projection.rate_hz, tuple(TERMS))
+        for name, row in self.channels.items():
+            spectra[name] = np.fft.rfft(row - row.mean(), projection.size)
+        return {name: spectrum[projection.used] for name, spectrum in spectra.items()}
 
     @cached_property
     def command_spectrum(self) -> Complex1D:
@@ -398,6 +403,13 @@ class ResponseRegression:
                 rows = log.part == part
                 rest[rows] -= coefficients @ columns[:, rows]
         return tuple(left)
+
+    def leave(self, log: ResponseData) -> Float1D:
+        """Return what the regression leaves of a log that it was not fitted to, m/s2, (row,)."""
+        columns = log.compute_columns(
+            self.structure.terms, self.delay_s, self.lags_s, self.resonance
+        )
+        return log.measured - log.delay_command(self.delay_s) - self.solve() @ columns
 
     def build_model(self) -> ResponseModel:
         """Return the model with the coefficients of all parts."""

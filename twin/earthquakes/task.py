@@ -9,6 +9,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.config.base import parse_toml, read_text
+from table_io.config.channel import is_table_channel
 from table_io.config.excitation import History, add_drive_margin, history_acceleration
 from table_io.config.folders import find_config, list_configs, resolve_config
 from table_io.config.profile import Profile, parse_profile
@@ -37,6 +38,7 @@ from twin.earthquakes.table_judgement import (
     NamedMotion,
     check_motion,
     choose_structure,
+    estimate_with_channels,
     find_predictable_band,
     fit_responses,
     join_motions,
@@ -121,15 +123,20 @@ def identify_table(
         trials.insert(2, try_hydraulic_fit(hydraulic, logs, data))
     chosen = choose_structure(trials)
     is_hydraulic = hydraulic is not None and chosen.id == HYDRAULIC
+    judged_data = prepare_data(judges, band_hz)
+    judgement = (
+        judge_other_logs(chosen, trials, judges, judged_data)
+        if judges
+        else judge_fitted_logs(chosen, trials, logs, data)
+    )
+    estimate = estimate_with_channels(data, judged_data)
     others = f" and {len(logs) - 1} more" if len(logs) > 1 else ""
     return TableTwinResult(
         f"{rig.title}, from {recordings[0].run}{others}",
         rig.moving_mass_kg,
         chosen.model,
         math.sqrt(hydraulic.cost) if hydraulic is not None and is_hydraulic else chosen.error,
-        judge_other_logs(chosen, trials, judges, band_hz)
-        if judges
-        else judge_fitted_logs(chosen, trials, logs, data),
+        judgement.model_copy(update={"estimate": estimate}),
         hydraulic.to_identification() if hydraulic is not None and is_hydraulic else None,
         discovery if is_hydraulic else None,
         logs[0].motion,
@@ -139,7 +146,13 @@ def identify_table(
 
 def _read_named_motion(path: Path, recording: Recording) -> NamedMotion:
     """Return the motion of a recording; InputError if it says nothing of its table."""
-    named = NamedMotion(str(path), read_table_motion(recording))
+    block, motion = _read_moving_block(recording)
+    channels = {
+        name: block.channel(name)
+        for name in block.channels
+        if is_table_channel(name) and np.isfinite(block.channel(name)).all()
+    }
+    named = NamedMotion(str(path), motion, channels)
     check_motion(named)
     return named
 
@@ -356,6 +369,11 @@ def read_table_motion(recording: Recording) -> TableRehearsal:
     the acceleration is the second derivative of the displacement. InputError if samples or other
     channels are missing.
     """
+    return _read_moving_block(recording)[1]
+
+
+def _read_moving_block(recording: Recording) -> tuple[Block, TableRehearsal]:
+    """Return the samples of a recording from rest to rest, and the motion of the table in them."""
     block = _find_whole_block(recording, CHANNELS[:2])
     profile = _read_profile(recording)
     moving = np.flatnonzero(block.label != Label.REST)
@@ -374,9 +392,10 @@ def read_table_motion(recording: Recording) -> TableRehearsal:
         band_hz = 0.0, min(HIGHEST_HZ, MAX_RATE_SHARE * block.rate_hz)
         projection = BandProjection(len(block), block.rate_hz, band_hz)
         acceleration = projection.to_samples(projection.differentiate(displacement))
-    return TableRehearsal(
+    motion = TableRehearsal(
         block.rate_hz, command, displacement, acceleration, reaction, has_accelerometer
     )
+    return block, motion
 
 
 def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:

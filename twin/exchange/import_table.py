@@ -12,7 +12,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.config.base import load_config, parse_toml
-from table_io.config.channel import read_channels
+from table_io.config.channel import declare_table_channels, read_channels
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
@@ -335,7 +335,8 @@ def _read_rig_toml(table: ForeignTable, options: ImportOptions) -> str:
         rig = (
             "simulated" if profile is None else load_config(profile, Profile, "test profile")[0].rig
         )
-    return load_config(find_config(rig, "rigs", profile, option), RigConfig, "rig file")[1]
+    rig_toml = load_config(find_config(rig, "rigs", profile, option), RigConfig, "rig file")[1]
+    return declare_table_channels(rig_toml, table.columns)
 
 
 def _build_run_config(
