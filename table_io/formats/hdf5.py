@@ -4,13 +4,21 @@ Datasets are named by their path; the cells of a cell array and the elements of 
 of MATLAB as in `mat`. Links into other files are never followed.
 """
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 
-from table_io.formats.table import TOML_TEXTS, ColumnKey, ForeignTable, extract_column
-from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, find_label
+from table_io.formats.table import (
+    MAX_MATRIX_COLUMNS,
+    TOML_TEXTS,
+    ColumnKey,
+    ForeignTable,
+    extract_column,
+)
+from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, add_fact, find_fact, find_label
 
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
@@ -60,6 +68,26 @@ def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
         table.add_array(
             name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0]
         )
+        rate_hz = _find_rate(item)
+        for column in (name, *(f"{name}:{k}" for k in range(1, MAX_MATRIX_COLUMNS + 1))):
+            if rate_hz and column in table.columns:
+                table.columns[column] = replace(table.columns[column], rate_hz=rate_hz)
+
+
+def _find_rate(item: Any) -> float | None:
+    """Return the sampling rate in Hz that the attributes of a dataset, or of its groups, state."""
+    place = item
+    while True:
+        facts: dict[str, float] = {}
+        for key, value in place.attrs.items():
+            fact = find_fact(key)
+            if fact in ("rate_hz", "interval_s") and np.size(value) == 1:
+                number = np.asarray(value).reshape(-1)[0]
+                if np.issubdtype(type(number), np.number):
+                    add_fact(facts, fact, float(number))
+        if facts or place.name == "/":
+            return facts.get("rate_hz")
+        place = place.parent
 
 
 def _add_references(table: ForeignTable, name: str, item: Any) -> None:

@@ -16,6 +16,8 @@ from table_io.formats.table import (
     TableColumns,
 )
 
+TIME_TYPES = (pa.types.is_timestamp, pa.types.is_duration)
+
 
 def scan_columns(path: Path) -> ForeignTable:
     """Scan the columns in the schema of a file; values are not read."""
@@ -27,13 +29,14 @@ def scan_columns(path: Path) -> ForeignTable:
             pa.types.is_floating,
             pa.types.is_integer,
             pa.types.is_boolean,
-            pa.types.is_timestamp,
+            pa.types.is_decimal,
+            *TIME_TYPES,
         )
         if not any(is_kind(column.type) for is_kind in numbers):
             table.dropped[column.name] = str(column.type)
             continue
         unit = (column.metadata or {}).get(b"unit", b"").decode(errors="replace")
-        unit = "s" if pa.types.is_timestamp(column.type) else unit
+        unit = "s" if any(is_kind(column.type) for is_kind in TIME_TYPES) else unit
         table.columns[column.name] = ForeignColumn(rows, (column.name,), unit)
     for key in TOML_TEXTS:
         if key.encode() in (schema.metadata or {}):
@@ -44,7 +47,9 @@ def scan_columns(path: Path) -> ForeignTable:
 def load_column(path: Path, key: ColumnKey) -> Any:
     """Read the values of a column, (row,); a null is NaN."""
     with pq.ParquetFile(path) as file:
-        return file.read([*key], use_threads=False).column(0).to_numpy()
+        column = file.read([*key], use_threads=False).column(0)
+    is_exact = pa.types.is_decimal(column.type)
+    return (column.cast(pa.float64()) if is_exact else column).to_numpy()
 
 
 def write_parquet(

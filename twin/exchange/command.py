@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
 from rich.table import Table
 
 from table_io.config.folders import resolve_config
@@ -164,7 +163,7 @@ def _print_proposal(file: Path, proposal: MapProposal) -> None:
         table.add_column(title, no_wrap=True)
     for item in proposal.columns:
         cells = (item.channel, item.column, item.unit or "-", item.reason)
-        table.add_row(*map(escape, cells))
+        table.add_row(*cells)
     print_table(console, table)
     if proposal.rate_hz is not None:
         print_line(f"sampling rate: {proposal.rate_hz:.9g} Hz")
