@@ -56,6 +56,7 @@ OTHER_TEXTS = {  # what a text is that is not read, by its first characters
     rb"\s*(\{\s*[\"}]|\[\s*[\[{])": "a JSON file", rb"\{\\rtf": "an RTF document",
 }  # fmt: skip
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
+MIN_ZERO_SHARE = 0.9  # of the upper bytes of a Latin text in UTF-16, if it has no mark
 SNIFF_BYTES = 4096
 MAX_LISTED_COLUMNS = 20  # in a message
 
@@ -98,7 +99,17 @@ def decode_text(data: bytes) -> str:
 
 def _list_encodings(start: bytes) -> tuple[str, ...]:
     """Return the encodings that a text may have, by its first bytes."""
-    return ("utf-16",) if start.startswith(UTF_16_MARKS) else ("utf-8-sig", "cp1252")
+    if start.startswith(UTF_16_MARKS):
+        return ("utf-16",)
+    for encoding, high in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
+        is_text = len(start) > 2 and not start.startswith((*OTHER_SIGNATURES,))
+        if (
+            is_text
+            and high.count(0) > MIN_ZERO_SHARE * len(high) > 0
+            and start.count(0) == high.count(0)
+        ):
+            return (encoding,)
+    return ("utf-8-sig", "cp1252")
 
 
 def _scan_text(path: Path, start: bytes) -> ForeignTable:
@@ -108,7 +119,7 @@ def _scan_text(path: Path, start: bytes) -> ForeignTable:
             "empty", where=path, remedy="give a table with a header and one row per sample"
         )
     encodings = _list_encodings(start)
-    is_binary = b"\0" in start and encodings != ("utf-16",)
+    is_binary = b"\0" in start and not encodings[0].startswith("utf-16")
     kinds = [
         kind for mark, kind in OTHER_SIGNATURES.items() if start.startswith(mark) and is_binary
     ]

@@ -108,6 +108,7 @@ GOOD: dict[str, str | bytes] = {
     "square.csv": text("Time [s],Disp [mm],Force [N]"),
     "bom.csv": ("\ufeff" + text("Time (s),Disp (mm),Force (N)")).encode(),
     "utf16.txt": text("Time (s)\tDisp (mm)\tForce (N)", mark="\t").encode("utf-16"),
+    "unmarked16.txt": text("Time (s),Disp (mm),Force (N)").encode("utf-16-le"),
     "utf16be.txt": b"\xfe\xff" + text("Time (s),Disp (mm),Force (N)").encode("utf-16-be"),
     "latin1.csv": comma(text("Prüfzeit [s];Weg [mm];Kraft [N]", mark=";")).encode("cp1252"),
     "mac.csv": text("Time (s),Disp (mm),Force (N)").replace("\n", "\r"),

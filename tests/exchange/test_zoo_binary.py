@@ -173,6 +173,10 @@ BAD: dict[str, tuple[Write, str]] = {
         write_tdms(DISP_200_HZ, ("Force", FORCE_N, {"wf_increment": 0.01} | IN_N)),
         "200 Hz",
     ),
+    "slow_force.tdms": (
+        write_tdms(DISP_200_HZ, ("Force", FORCE_N[::4], {"wf_increment": 0.02} | IN_N)),
+        "'Force' has 60 rows at 50 Hz, others 240 at 200 Hz",
+    ),
     "texts.parquet": (write_parquet(note=["a"] * ROW_COUNT), "with no column of numbers"),
     "unnamed.npz": (lambda path: np.savez(path, TIME, DISP_MM), "no column is known"),
     "matrix.mat": (write_mat(data=np.array(ROWS)), "no column is known"),

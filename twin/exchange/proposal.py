@@ -182,14 +182,7 @@ def propose_map(
     if not has_time and rate_hz is None:
         wrong = describe_unusable_times(table, names)
         questions.append(f"{wrong or 'no times and no sampling rate in the file'}: state --rate HZ")
-    size = table.columns[names[0]].size if names else 0
-    for name, column in table.columns.items():
-        is_channel = find_quantity(name, column.unit) in CHANNELS_OF
-        if is_channel and size != column.size > MIN_LENGTH_SHARE * size and name not in names:
-            questions.append(
-                f"column {name!r} has {column.size} rows, others {size}, and no rate tells which "
-                "are the same: leave it out in a map, or import it alone"
-            )
+    questions += _ask_other_sampling(table, names)
     if not chosen:
         questions.append("no column is known by its name or unit: state the columns in a map")
     clocks = {info.clock for info in infos}
@@ -207,6 +200,26 @@ def propose_map(
         dropped=_list_dropped(table, names),
         alternatives=alternatives,
     )
+
+
+def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:
+    """Yield questions on columns of a channel's quantity that are no rows of the recording."""
+    if not names:
+        return
+    usual = table.columns[names[0]]
+    for name, column in table.columns.items():
+        if name in names or find_quantity(name, column.unit) not in CHANNELS_OF:
+            continue
+        if column.rate_hz and usual.rate_hz and column.rate_hz != usual.rate_hz:
+            yield (
+                f"column {name!r} has {column.size} rows at {column.rate_hz:.9g} Hz, others "
+                f"{usual.size} at {usual.rate_hz:.9g} Hz: resample it, or leave it out in a map"
+            )
+        elif column.size > MIN_LENGTH_SHARE * usual.size:
+            yield (
+                f"column {name!r} has {column.size} rows, others {usual.size}, and no rate tells "
+                "which are the same: leave it out in a map, or import it alone"
+            )
 
 
 def _list_dropped(table: ForeignTable, names: list[str]) -> tuple[str, ...]:
