@@ -17,9 +17,11 @@ from table_io.errors import InputError, format_pip_line
 from table_io.formats.lvm import FIRST_WORDS, parse_lvm
 from table_io.formats.sandbox import run_isolated
 from table_io.formats.strong_motion import (
+    KNET_WORDS,
     PEER_SUFFIXES,
     SMC_WORDS,
     is_volume_2,
+    parse_knet,
     parse_peer,
     parse_volume_2,
 )
@@ -152,6 +154,8 @@ def _parse_lines(file: TextIO, path: Path) -> ForeignTable:
             where=path,
             remedy="get the record as V2 or AT2, or export it as CSV",
         )
+    if first.startswith(KNET_WORDS):
+        return parse_knet(file, path)
     if path.suffix.lower() in PEER_SUFFIXES:
         return parse_peer(file, path)
     if is_volume_2(path.name):

@@ -1,10 +1,10 @@
-"""Readers of strong-motion records in text: PEER AT2 and DT2, CSMIP and COSMOS Volume 2.
+"""Readers of strong-motion records in text: PEER AT2 and DT2, CSMIP and COSMOS Volume 2, K-NET.
 
 ESM, ITACA and others whose header lines are `KEY: value` are text tables of one column (`text`).
 Sources: https://ngawest2.berkeley.edu, format of .AT2 and .DT2, old and new headers; California
 Strong Motion Instrumentation Program, Report OSMS 85-03 (line "points of accel data equally spaced
-at"); Strong-motion data format of COSMOS, V1.20 (line "acceleration pts", time step in entry 34 of
-the real header).
+at"); K-NET ASCII format (https://www.kyoshin.bosai.go.jp); Strong-motion data format of COSMOS,
+V1.20 (line "acceleration pts", time step in entry 34 of the real header).
 """
 
 import math
@@ -22,6 +22,8 @@ from table_io.formats.words import normalize_unit
 
 PEER_SUFFIXES = (".at2", ".dt2", ".vt2")
 PEER_KIND, VOLUME_2_KIND = "a PEER record", "a CSMIP or COSMOS V2 record"
+KNET_KIND = "a K-NET record"
+KNET_WORDS = "Origin Time"
 SMC_WORDS = re.compile(r"\s*[12] (?:un)?corrected (?:accelerogram|velocity|displacement)", re.I)
 HISTORY_UNITS = ("g", "cm/s2", "m/s2", "mm/s2", "cm", "mm", "m")
 MAX_HEADER_CHARS = 200  # of a line, in which a header is looked for
@@ -63,6 +65,32 @@ def parse_peer(file: TextIO, path: Path) -> ForeignTable:
     step_s = _parse_step(match["dt"] or match["dt0"], place)
     return ForeignTable(
         path, PEER_KIND, {"history": _make_history(values, unit, step_s, 1)}, first_row=at + 2
+    )
+
+
+def parse_knet(file: TextIO, path: Path) -> ForeignTable:
+    """Read a record of K-NET or KiK-net: header, then counts, eight a line, about their mean."""
+    lines = file.read().splitlines()
+    patterns = {
+        "rate": rf"^Sampling Freq\(Hz\)\s+({NUMBER})",
+        "scale": rf"^Scale Factor\s+({NUMBER})\(gal\)/({NUMBER})",
+        "end": r"^Memo\.",
+    }
+    places = {key: _find_lines(lines, re.compile(text)) for key, text in patterns.items()}
+    if not all(places.values()):
+        raise InputError(
+            f"{KNET_KIND} without {', '.join(key for key, lines in places.items() if not lines)}",
+            where=path,
+            allowed="lines of Sampling Freq(Hz), Scale Factor and Memo.",
+        )
+    at = places["end"][0][0]
+    counts = np.array(_parse_words(lines[at + 1 :], path, at + 2, str.split))
+    scale = places["scale"][0][1]
+    factor = float(scale[1]) / float(scale[2])
+    values = factor * (counts - counts.mean()) if counts.size else counts
+    step_s = 1.0 / float(places["rate"][0][1][1])
+    return ForeignTable(
+        path, KNET_KIND, {"history": _make_history([*values], "cm/s2", step_s, 1)}, first_row=at + 2
     )
 
 

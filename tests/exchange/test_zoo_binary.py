@@ -91,6 +91,11 @@ def fill_rate(file: Any, **attributes: float) -> None:
         file["run"].attrs[key] = value
 
 
+def fill_version_73(file: Any) -> None:
+    for name, values in (("time_s", TIME), ("disp_mm", DISP_MM), ("force_N", FORCE_N)):
+        file[name] = values[None]
+
+
 def fill_compound(file: Any) -> None:
     fields = [("time (s)", float), ("disp (mm)", float), ("force (N)", float)]
     file["data"] = np.array(ROWS, dtype=fields)
@@ -140,10 +145,7 @@ GOOD: dict[str, Write] = {
     "compound.h5": write_hdf5(fill_compound),
     "rate.h5": write_hdf5(lambda file: fill_rate(file, sample_rate=200.0)),
     "dt.hdf5": write_hdf5(lambda file: fill_rate(file, dt=0.005)),
-    "v73.mat": write_hdf5(lambda file: [
-        file.create_dataset(name, data=values[None])
-        for name, values in (("time_s", TIME), ("disp_mm", DISP_MM), ("force_N", FORCE_N))
-    ] and None),
+    "v73.mat": write_hdf5(fill_version_73),
     "plain.parquet": write_parquet(time=TIME, disp_mm=DISP_MM, force_N=FORCE_N),
     "index.parquet": write_parquet(disp_mm=DISP_MM, force_N=FORCE_N, timestamp=STAMPS),
     "zone.parquet": write_parquet(

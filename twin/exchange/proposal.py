@@ -208,7 +208,8 @@ def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:
         return
     usual = table.columns[names[0]]
     for name, column in table.columns.items():
-        if name in names or find_quantity(name, column.unit) not in CHANNELS_OF:
+        is_known = name in names or name in LABEL_UNITS or name.startswith(TWIN_PREFIX)
+        if is_known or find_quantity(name, column.unit) not in CHANNELS_OF:
             continue
         if column.rate_hz and usual.rate_hz and column.rate_hz != usual.rate_hz:
             yield (

@@ -329,3 +329,21 @@ def test_the_checksum_is_that_of_the_file_with_its_own_line_ends(tmp_path: Path)
     path.write_text(TEST + f'{keys}sha256 = "{64 * "0"}"\n')
     with raises_input_error(key="excitation.file", problem=excitation.checksum, allowed="00000"):
         load_profile(path)
+
+
+def test_read_series_of_a_knet_record() -> None:
+    """Counts about their mean, in gal by the scale factor of the header."""
+    head = (
+        "Origin Time       2026/03/29 01:59:00", "Lat.              38.1",
+        "Station Code      XYZ001", "Sampling Freq(Hz) 100Hz", "Duration Time(s)  1",
+        "Dir.              N-S", "Scale Factor      3920(gal)/6182761", "Max. Acc. (gal)   1.2",
+        "Memo.",
+    )  # fmt: skip
+    counts = 12345 + np.round(1e5 * np.sin(0.3 * np.arange(96))).astype(int)
+    lines = [" ".join(f"{count:8d}" for count in counts[k : k + 8]) for k in range(0, 96, 8)]
+    series = read("\n".join([*head, *lines]), "XYZ0012603290159.NS")
+    expected = 1e-2 * 3920 / 6182761 * (counts - counts.mean())
+    np.testing.assert_allclose(series.values, expected, rtol=1e-12)
+    assert (series.rate_hz, series.quantity) == (100.0, "acceleration")
+    with raises_input_error(problem="K-NET record without scale"):
+        read("\n".join([*head[:6], *head[7:], *lines]), "a.EW")
