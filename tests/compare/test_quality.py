@@ -163,6 +163,22 @@ def test_find_doubts_of_an_accelerometer(alter: Callable[[Float1D], Float1D], ki
     assert (doubt.kind, {*doubt.channels}) == (kind, {*table})
 
 
+def test_find_doubts_takes_no_narrow_band_for_a_delay() -> None:
+    """A slow sweep, whose lines lie so close that a delay and a high pass look alike."""
+    for low_hz, high_hz, corner_hz in ((0.84, 1.36, 0.0), (2.5, 3.3, 0.0), (1.6, 2.4, 0.25)):
+        phase = np.cumsum(2 * np.pi * (low_hz + (high_hz - low_hz) * TIME / TIME[-1])) / RATE_HZ
+        disp = 0.01 * RAMP * (1.0 + 0.3 * np.sin(0.7 * TIME)) * np.sin(phase)
+        acc = np.gradient(np.gradient(disp, TIME), TIME)
+        if corner_hz:
+            lines = 1j * np.fft.rfftfreq(TIME.size, 1.0 / RATE_HZ)
+            acc = np.fft.irfft(np.fft.rfft(acc) * lines / (lines + corner_hz), TIME.size)
+        table = {
+            "table_disp_m": disp + 1e-5 * NOISE[0],
+            "table_acc_m_s2": acc + 0.01 * NOISE[1],
+        }
+        assert find_doubts(table, RATE_HZ) == []
+
+
 def make_blocks(channels: dict[str, Float1D]) -> list[Block]:
     """Return blocks of 100 samples from sample 50 on; the third one is lost."""
     none = np.zeros(100, dtype=np.int64)

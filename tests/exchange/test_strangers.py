@@ -9,6 +9,8 @@ import pytest
 from table_io.block import Float1D
 from table_io.records import SampleGap
 from tests.input_errors import raises_input_error
+from tests.studies.evidence.__main__ import LABS
+from tests.studies.evidence.laboratory import Specimen, StepTest, record, write_table
 from twin.discovery.task import identify
 from twin.exchange.import_table import ImportOptions, import_table, propose_import
 from twin.recording.reader import read_recording
@@ -102,3 +104,14 @@ def test_import_at_a_rate_within_the_limits_is_a_log_or_names_the_rate(
         return
     import_table(table, log, ImportOptions(accept=True))
     assert read_recording(log).start.rate_hz == pytest.approx(rate_hz, rel=1e-6)
+
+
+@pytest.mark.parametrize("lab", ["plain", "filter", "pink"])
+def test_a_clean_table_test_at_200_hz_raises_no_alarm_of_sensors(tmp_path: Path, lab: str) -> None:
+    """No limit of an instrument lies beyond what the rate of the recording shows."""
+    test = StepTest(2.0, 4.4, 0.8, cycles=6, rate_hz=200.0)
+    columns = record(Specimen(gap_mm=40.0), LABS[lab], 30, test)
+    table, log = write_table(columns, tmp_path / "a.csv"), tmp_path / "a.mcap"
+    import_table(table, log, ImportOptions(accept=True, settings={"mass_kg": 550.0}))
+    sensors = identify([log]).report.sensors
+    assert [check.kind for check in sensors.checks if not check.healthy] == []

@@ -58,6 +58,7 @@ SURE_CORRELATION = 0.95
 MAX_DELAY_S, MAX_DELAY_SAMPLES = 4e-3, 3.0  # of filters and multiplexers; the larger one counts
 MIN_GAIN_IN_CORRELATION = 0.03  # by a delay of many samples
 DELAY_SIGMA = 4.0
+MAX_PHASE_LEFT = 0.25  # of the phases, or of what a high pass leaves, by a delay that is one
 PART_COUNT = 8  # of a test, in which the work of a force is added up
 MAX_TAKEN_SHARE = 0.1  # of the work done by a force: work taken, by a force that is reversed
 # Of confused units: g, mm, inch, cm, in/s2 and their combinations.
@@ -460,14 +461,21 @@ def _respond(expected: Float1D, read: Float1D, rate_hz: float, order: int) -> _P
         return _PairResponse(at_once, best, 0.0, False, gain, share)
     # the phase of a delay rises with frequency, that of a high pass falls
     weight = np.sqrt(np.abs(cross))
-    basis = np.column_stack([-omega, 1.0 / omega]) * weight[:, None]
     phase = np.angle(cross) * weight
-    answer, *_ = np.linalg.lstsq(basis, phase, rcond=None)
-    left = phase - basis @ answer
-    variance = np.linalg.pinv(basis.T @ basis)[0, 0] * float(left @ left) / (omega.size - 2)
-    delay_s = float(answer[0])
-    is_sure = abs(delay_s) > _max_delay(rate_hz) + DELAY_SIGMA * float(np.sqrt(variance))
+    delay_s, left = _fit_phase(phase, -omega * weight)
+    _, by_high_pass = _fit_phase(phase, weight / omega)
+    variance = left / (omega.size - 1) / float(np.sum((omega * weight) ** 2))
+    is_sure = abs(delay_s) > _max_delay(rate_hz) + DELAY_SIGMA * float(
+        np.sqrt(variance)
+    ) and left < MAX_PHASE_LEFT * min(float(phase @ phase), by_high_pass)
     return _PairResponse(at_once, best, delay_s, is_sure, gain, share)
+
+
+def _fit_phase(phase: Float1D, column: Float1D) -> tuple[float, float]:
+    """Return (coefficient of a column by least squares, sum of squares that it leaves)."""
+    coefficient = float(column @ phase / (column @ column))
+    left = phase - coefficient * column
+    return coefficient, float(left @ left)
 
 
 def _compare_lines(
