@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
 from itertools import product
 from types import FunctionType
 
@@ -19,6 +19,7 @@ PROBED_DEFORMATIONS = {True: (1e-4, 1e-3, 3e-3), False: (-0.03, -3e-3, -1e-4, 1e
 PROBED_RATES = (-0.3, -0.01, 0.01, 0.3)
 PROBED_DRIVES = ((0.0, 0.0), (1.0, 100.0))
 MAX_GROWTH_SHARE = 1e-6  # of the largest eigenvalue of states: rounding of a lossless one
+MAX_KNOWN_LAWS = 1000  # whose properties are kept: a fit changes one of several at a time
 STATE_STEP = 1e-6  # of differences by a state, in its unit
 
 ForceFunction = Callable[[float, float, float, float, tuple[float, ...]], float]
@@ -43,7 +44,8 @@ def build_laws(effects: tuple[Effect, ...]) -> FunctionType:
     return build_function(write_laws(effects))
 
 
-def write_laws(effects: Sequence[Effect]) -> str:
+@cache
+def write_laws(effects: tuple[Effect, ...]) -> str:
     """Return the text of `build_laws`: one flat function compiles several times faster."""
     sums = ["force", *(f"rate_{state}" for state in range(MAX_STATES))]
     lines = ["def laws(place, q, w, a, t, s, c):", f"    {' = '.join(sums)} = 0.0"]
@@ -110,6 +112,7 @@ def list_probes(
         yield q, w, a, t
 
 
+@lru_cache(MAX_KNOWN_LAWS)
 def law_properties(effect: Effect, c: tuple[float, ...]) -> LawProperties:
     """Return the largest stiffness and rate of the states of a law over the probed motions.
 

@@ -42,7 +42,7 @@ def compile_laws(effects: Sequence[Effect]) -> AddedLaws | None:
 
     Compiled once in every process: numba's cache on disk does not know that a law changed.
     """
-    return _compile_text(write_laws(effects)) if effects else None
+    return _compile_text(write_laws(tuple(effects))) if effects else None
 
 
 @cache

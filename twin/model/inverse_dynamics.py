@@ -423,6 +423,6 @@ def depends_on_history(model: Model) -> bool:
 
     Where it was not, every force does: a face that is touched stays touched while it pushes.
     """
-    p, _ = kernel_coefficients(_split_laws(model, is_contact_known=True)[0])
-    has_states = any(effect.states for effect, _ in model.added_laws)
-    return has_states or max(p.fy, p.k1, p.kb, p.pull) > 0.0
+    if any(effect.states for effect, _ in model.added_laws):
+        return True
+    return any(model.coefficients.get(name, 0.0) > 0.0 for name in ("fy", "k1", "kb", "pull"))

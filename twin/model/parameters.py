@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 
 from table_io.errors import InputError, suggest
 
@@ -44,7 +44,7 @@ class Parameters:
 
     def as_dict(self) -> dict[str, float]:
         """Return field name -> SI value."""
-        return asdict(self)
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, float]) -> "Parameters":
