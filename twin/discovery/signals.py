@@ -578,11 +578,14 @@ def _find_rest(block: Block) -> Bool2D:
 def _measure_rest(
     columns: Mapping[str, Float1D], at_rest: Bool2D, noise: Mapping[str, Float1D]
 ) -> dict[str, tuple[float, float]]:
-    """Return (mean, std error) of each channel at rest, SI; the tare's own error is included."""
+    """Return (mean, std error) of each tared channel at rest, SI, with the tare's own error.
+
+    The force of a damper is none: friction or a preload may hold one at rest.
+    """
     rest_values = {}
     for key, values in columns.items():
         finite = values[at_rest & np.isfinite(values)]
-        if finite.size >= 100:
+        if finite.size >= 100 and key != "damper_force_n":
             rest_values[key] = (
                 float(finite.mean()),
                 float(noise[key][1]) * float(np.sqrt(2.0 / finite.size)),
