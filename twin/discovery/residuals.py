@@ -58,6 +58,7 @@ UNKNOWN_ERROR_SHARE = 0.002
 FORM_ERROR_SHARE = 0.02
 MAX_LEVEL = 1.5  # mean square over the noise that may remain where the residual is said to be noise
 MIN_CHANGES = 8  # values of a step that show the noise
+CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
 MAX_SAMPLES = 200_000  # moving samples of all logs together; limits memory
@@ -614,8 +615,9 @@ class LogResiduals:
         """Return the residuals with the noise that they show themselves about a fitted model.
 
         What does not repeat between the cycles of a step is noise, also where neither the rest nor
-        a quiet band shows it: half the mean square of the difference of successive cycles, the
-        lower quartile over the steps, because chaotic steps never repeat. And instruments err by a
+        a quiet band shows it: half the mean square of the difference of successive cycles, less
+        what the motion itself did not repeat, the lower quartile over the steps. And instruments
+        err by a
         share of the force in ways of which no nuisance is a form, the same in every cycle, as do
         the forms of the laws that the model has beside its `base`, of their own force: the weight
         counts these errors as noise of single steps.
@@ -630,10 +632,10 @@ class LogResiduals:
         learned = replace(self, noise_scale=scale, nuisances=None)
         measured = learned.measured_entries * learned.weight
         squares = measured**2
-        errors = (
-            (UNKNOWN_ERROR_SHARE, squares),
-            (FORM_ERROR_SHARE, (laws[self.entry_row < len(self.rows)]) ** 2),
-        )
+        forms = laws[self.entry_row < len(self.rows)] ** 2
+        # laws that nearly cancel each other show no more of their form than what they explain
+        forms *= min(1.0, float(squares.sum()) / max(float(forms.sum()), 1e-300))
+        errors = ((UNKNOWN_ERROR_SHARE, squares), (FORM_ERROR_SHARE, forms))
         parts = [(share**2 * float(of.sum()), learned._count_different(of)) for share, of in errors]
         weight = math.sqrt(1.0 + sum(part / count for part, count in parts))
         terms = self.nuisances
@@ -670,23 +672,29 @@ class LogResiduals:
         return max(large / (cycles if steps else 1.0), 1.0)
 
     def _measure_change(self, row: int, r: Float1D) -> float:
-        """Return the mean square over the noise that a row does not repeat; 1 if unknown."""
+        """Return the mean square over the noise that a row does not repeat; 1 if unknown.
+
+        A motion that changes from cycle to cycle changes what a missing law leaves, by as large a
+        share as the force, or `CHANGE_ORDER` times that for a law of so high an order.
+        """
         basis, facts = self.bases[row], np.flatnonzero(self.entry_row == row)
         if basis is None or not facts.size:
             return 1.0
         sample, m = self.entry_sample[facts], self.motion()
         measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
         variances = []
+        force = self.measured_entries[facts] * self.weight
         for number in np.unique(m.step[sample][measured]):
             chosen = measured & (m.step[sample] == number)
             cycles, index = np.unique(m.cycle[sample][chosen], return_inverse=True)
-            order = basis.order[chosen]
-            table = np.full((cycles.size, int(order.max(initial=0)) + 1), np.nan)
-            table[index, order] = r[facts[chosen]]
-            changes = np.diff(table, axis=0)
-            known = changes[np.isfinite(changes)]
-            if known.size >= MIN_CHANGES:
-                variances.append(0.5 * float(np.mean(known**2)))
+            table = np.full((2, cycles.size, int(basis.order[chosen].max(initial=0)) + 1), np.nan)
+            table[:, index, basis.order[chosen]] = r[facts[chosen]], force[chosen]
+            changes = np.diff(table, axis=1)
+            if np.isfinite(changes[0]).sum() >= MIN_CHANGES:
+                changed, changed_force = 0.5 * np.nanmean(changes**2, axis=(1, 2))
+                square, force_square = np.nanmean(table**2, axis=(1, 2))
+                share = changed_force / max(force_square, 1e-300)
+                variances.append(changed - CHANGE_ORDER**2 * share * square)
         return float(np.percentile(variances, 25)) if variances else 1.0
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
