@@ -344,7 +344,7 @@ def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
 def test_a_proposed_law_is_among_the_rivals(relaxing: Recorded) -> None:
     problem = relaxing.prepared.problem
     null, law = relaxing.fit().fitted, relaxing.fit("cubic_stiffness").fitted
-    unexplained = DiscoveryVerdict("unexplained", null, 0.9, (), None, 1.0, True, "")
+    unexplained = DiscoveryVerdict("unexplained", null, 0.9, 0.9, (), None, 1.0, True, "")
     rivals = list_rivals(problem, SelectionResult(null, null), unexplained, law)
     assert [rival.fitted for rival in rivals] == [null, law]
     assert all(rival.can_be_simulated for rival in rivals)
@@ -354,7 +354,7 @@ def test_intervals_hold_what_an_inexact_form_leaves(relaxing: Recorded) -> None:
     """Half of the residual squares: as much in each of the parameters, over their white errors."""
     best = relaxing.fit("maxwell_damper", k1=12e3, tau=0.06).fitted
     key = EffectKey("maxwell_damper", "k1", "")
-    exact = DiscoveryVerdict("named", best, 0.9, (), None, best.cost, False, "")
+    exact = DiscoveryVerdict("named", best, 0.9, 0.9, (), None, best.cost, False, "")
     unseen = widen_for_form(exact)
     assert unseen.best.fit.std_errors == best.fit.std_errors
     half = replace(exact, floor=best.cost / 2)

@@ -81,7 +81,10 @@ def build_verdict(
     return Verdict(
         verdict=verdict.outcome,
         why=format_reason(discovery),
-        effects=[_build_effect(effect, best.fit, verdict.confidence) for effect in best.effects],
+        confidence=verdict.confidence,
+        effects=[
+            _build_effect(effect, best.fit, verdict.effects_confidence) for effect in best.effects
+        ],
         ambiguous=[[*names], *([*ids] for ids in alternatives)] if alternatives else [],
         candidates=_list_candidates(
             selection.null,

@@ -36,6 +36,7 @@ from twin.discovery.words import (
     describe_proposal,
     describe_sensors,
     format_interval,
+    format_percent,
     format_verdict,
 )
 from twin.report.finalize import EXIT_INTERRUPTED
@@ -228,7 +229,10 @@ def _format_best(progress: SelectionProgress) -> str:
 def print_verdict(verdict: Verdict) -> None:
     """Print the verdict, the misfit, the fitted parameters and the notes."""
     print_line(f"{verdict.verdict}: {format_verdict(verdict)}")
-    print_line(f"  {verdict.why}")
+    certainty = (
+        "" if verdict.confidence is None else f" (probability {format_percent(verdict.confidence)})"
+    )
+    print_line(f"  {verdict.why}{certainty}")
     misfit = verdict.gap
     columns = " | ".join(
         f"{label} {value:.3g}"

@@ -27,9 +27,11 @@ from twin.discovery.words import (
     describe_sensors,
     format_effect,
     format_interval,
+    format_percent,
     format_verdict,
     tabulate_channels,
     tabulate_comparisons,
+    tabulate_nuisances,
     typeset_proposal,
 )
 from twin.drawing.page import MAX_PLAIN, embed_images, format_significant, write_page
@@ -60,6 +62,8 @@ def write_discovery_page(folder: Path, result: DiscoveredModel) -> Path:
         proposed_terms=typeset_proposal(verdict.law) if verdict.law else [],
         quantity=format_interval,
         held_out=describe_held_out(view),
+        percent=format_percent,
+        nuisance_rows=tabulate_nuisances(verdict.nuisances),
         rows=list_parameter_rows(verdict, [log.signals.name for log in logs]),
         logs=[_log_facts(log) for log in logs],
         sections=order_sections(verdict),

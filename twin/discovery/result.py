@@ -43,7 +43,9 @@ class EffectResult(Contract):
 
     id: str = Field(description="id in the library of effects")
     channel: str | None = Field(None, description="of a sensor effect; absent for others")
-    confidence: Misfit = Field(description="confidence in the effects, 0 to 1")
+    confidence: Misfit = Field(
+        description="probability that the effects are all that the model lacks, 0 to 1"
+    )
     parameters: dict[str, Interval] = Field(description="fitted parameters")
     slip_speed: Interval | None = Field(None, description="only of Coulomb friction")
 
@@ -286,6 +288,7 @@ class Verdict(Contract):
         description="whether the missing effects could be named"
     )
     why: str = Field(description="reason of the verdict")
+    confidence: Ratio = Field(None, description="probability of the verdict; absent in old files")
     effects: list[EffectResult] = Field(description="effects added to the model")
     ambiguous: list[list[str]] = Field(description="sets of effects that fit as well")
     candidates: list[CandidateResult] = Field(description="every refitted set, best first")

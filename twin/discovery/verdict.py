@@ -42,7 +42,8 @@ class DiscoveryVerdict:
 
     outcome: str
     best: FittedSet
-    confidence: float
+    confidence: float  # probability of the verdict
+    effects_confidence: float  # probability that the effects are all that the model lacks
     alternatives: tuple[FittedSet, ...]  # about as probable as the best, if ambiguous
     generic: FittedSet | None  # set with a generic term that shows the form of what remains
     floor: float
@@ -78,27 +79,31 @@ def judge_selection(
         )
 
     def conclude(
-        outcome: str, fitted: FittedSet, certainty: float, reason: str,
-        alternatives: tuple[FittedSet, ...] = (),
+        outcome: str, fitted: FittedSet, probability: float, reason: str,
+        alternatives: tuple[FittedSet, ...] = (), effects_confidence: float | None = None,
     ) -> DiscoveryVerdict:  # fmt: skip
+        of_effects = probability if effects_confidence is None else effects_confidence
         return DiscoveryVerdict(
-            outcome, fitted, certainty, alternatives, generic, floor, has_remainder, reason,
-            place=place if has_remainder else "",
+            outcome, fitted, probability, of_effects, alternatives, generic, floor, has_remainder,
+            reason, place=place if has_remainder else "",
         )  # fmt: skip
 
     where = f" in the {place}" if beside > 0.5 else ""
+    alone = probability * (1.0 - beside)
+    # a name needs an absolute fit: what it leaves must be noise
+    unknown = 1.0 - EXCLUDED_PROBABILITY if remains else beside
     if not best.effects:
         if has_remainder:
             reason = f"the residual exceeds the noise, by an unknown force{where}"
-            return conclude("unexplained", null, max(beside, 0.5), reason)
-        return conclude("none", null, probability, "the residual is noise")
+            return conclude("unexplained", null, unknown, reason)
+        return conclude("none", null, alone, "the residual is noise")
     if has_remainder:
-        # a name needs an absolute fit: what it leaves must be noise
         names = " + ".join(best.names)
         verb = "leaves" if len(best.names) == 1 else "leave"
         reason = f"{names} {verb} a part of the misfit that is no noise, an unknown force{where}"
-        certainty = 0.0 if remains else probability * (1.0 - beside)
-        return conclude("unexplained", best, certainty, reason)
+        return conclude(
+            "unexplained", best, unknown, reason, effects_confidence=0.0 if remains else alone
+        )
     limits = {c.name: c.effect.limits for c in problem.library if c.effect is not None}
     none = by_set.get(frozenset(), 0.0)
     containing = [p for names, p in by_set.items() if _holds_effects(names, best, limits)]
@@ -120,7 +125,8 @@ def judge_selection(
             )
             listed = "; ".join(name for _, name in others)
             reason = f"not separated from {' + '.join(best.names)}: {listed}"
-            return conclude("ambiguous", best, probability, reason, rivals)
+            named = min(sum(by_set.values()), 1.0)
+            return conclude("ambiguous", best, named, reason, rivals, probability)
         probability = sum(p for names, p in by_set.items() if common <= names)
         return conclude("named", core, probability, "every probable explanation has it")
     return conclude("named", best, probability, "the residual is noise")

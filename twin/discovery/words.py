@@ -8,6 +8,7 @@ from twin.discovery.build_verdict import REFITTED_SUFFIX
 from twin.discovery.result import (
     EffectResult,
     ExcludedSet,
+    FittedNuisance,
     Interval,
     LawTerm,
     ProposedLaw,
@@ -43,14 +44,20 @@ KIND_LABELS = {
     "plate": "mass in front of the cells",
     "gap": "true less stated gap",
     "offset": "offset",
+    "slow_offset": "slow drift of the offset",
+    "linearity": "linearity error",
+    "share_slope": "change of the share with position",
+    "cross": "table's acceleration in the channel",
 }
 CHANNEL_KINDS = ("noise", "hum", "one_over_f", "resolution", "filter")  # of a channel at rest
 LEAST_SHOWN = 1e-12  # SI: a smaller value is that of a bound
+LEAST_SHARE = 1e-3  # that is shown as a number
 # Units in which quantities are read: factor and name, by kind or by unit in SI.
 SHOWN_UNITS = {
     "s": (1e6, "\u00b5s"), "m": (1e6, "\u00b5m"), "gain": (100.0, "%"),
     "resolution": (100.0, "%"), "remainder": (100.0, "%"), "plate": (100.0, "%"),
-    "share": (100.0, "%"),
+    "share": (100.0, "%"), "linearity": (100.0, "%"), "share_slope": (100.0, "%"),
+    "cross": (100.0, "%"),
 }  # fmt: skip
 
 
@@ -229,8 +236,48 @@ def tabulate_comparisons(sensors: Sensors) -> list[CheckRow]:
     return rows
 
 
-def _format_size(check: SensorCheckResult, value: float) -> str:
-    unit = check.unit
-    factor, name = SHOWN_UNITS.get(check.kind, SHOWN_UNITS.get(unit, (1.0, unit)))
+@dataclass(frozen=True)
+class NuisanceRow:
+    """Fitted error of an instrument or of the set-up: where, what, how large, over the typical."""
+
+    log: str
+    label: str
+    size: str
+    typical: float
+
+
+def tabulate_nuisances(nuisances: Sequence[FittedNuisance]) -> list[NuisanceRow]:
+    """Return a row per fitted error of an instrument or of the set-up."""
+    return [
+        NuisanceRow(
+            each.log,
+            ", ".join(filter(None, (KIND_LABELS[_generalize(each.kind)], each.place))),
+            _format_size(each, each.value),
+            each.typical,
+        )
+        for each in nuisances
+    ]
+
+
+def _generalize(kind: str) -> str:
+    """Return the kind of an error without the number of its term."""
+    if kind.startswith("chebyshev"):
+        return "linearity"
+    return "slow_offset" if kind.startswith("offset") and kind != "offset" else kind
+
+
+def format_percent(share: float) -> str:
+    """Format a share or probability in percent, near 0 and 1 as a bound."""
+    if 0.0 < share < LEAST_SHARE:
+        return f"< {100 * LEAST_SHARE:g} %"
+    if 1.0 - LEAST_SHARE < share < 1.0:
+        return f"> {100 * (1.0 - LEAST_SHARE):g} %"
+    return f"{format_significant(100 * share, 3)} %"
+
+
+def _format_size(error: SensorCheckResult | FittedNuisance, value: float) -> str:
+    """Format the size of an error of an instrument in the unit in which it is read."""
+    unit = error.unit
+    factor, name = SHOWN_UNITS.get(_generalize(error.kind), SHOWN_UNITS.get(unit, (1.0, unit)))
     shown = factor * value if abs(value) > LEAST_SHOWN else 0.0
     return f"{format_significant(shown)} {name}".strip()

@@ -218,7 +218,8 @@ def play(case: Case) -> dict[str, object]:
             "blamed": [
                 f"{c.kind} {'+'.join(c.channels)}" for c in verdict.sensors.checks if not c.healthy
             ],
-            "confidence": round(verdict.effects[0].confidence, 3) if verdict.effects else None,
+            "confidence": round(verdict.confidence or 0.0, 3),
+            "excludes": {size.id: size.force_share for size in verdict.excludes},
             "before": round(verdict.gap.held_out_before, 3),
             "after": round(verdict.gap.held_out_after, 3),
             "floor": round(verdict.gap.noise_floor, 3),
