@@ -30,7 +30,7 @@ from twin.discovery.spectra import (
 from twin.model.model import SensorModel
 
 LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
-OPEN_END_S = 0.5  # excluded at an end of the record that is not at rest
+OPEN_END_S = 0.5  # excluded at each end of the record
 # Of the power of a drive with a single frequency: within this width, of the frequency, about it.
 MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 # Power over that of the noise above which a band holds forces, and the share of the corner of a
@@ -476,10 +476,8 @@ def build_signals(
     grid = FrequencyGrid(len(block), block.rate_hz)
     usable = exclude_margins(good, round(LOST_MARGIN_S * block.rate_hz))
     margin = round(OPEN_END_S * block.rate_hz)
-    if block.label[0] != Label.REST:
-        usable[:margin] = False
-    if block.label[-1] != Label.REST:
-        usable[-margin:] = False
+    # also where the drive rests: the mass may not yet
+    usable[:margin], usable[-margin:] = False, False
     size = -(-len(block) // grid.decimation)
     spectra = {key: grid.to_spectrum(values) for key, values in columns.items()}
     frequency = grid.omega / (2 * np.pi * block.rate_hz)
