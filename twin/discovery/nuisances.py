@@ -22,8 +22,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Chebyshev
+from scipy.ndimage import uniform_filter1d
 
-from table_io.block import Bool2D
+from table_io.block import Bool2D, Float1D
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.least_squares import FitResult, MapFunction
 from twin.discovery.parameters import (
@@ -64,6 +65,7 @@ TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
 TYPICAL_GAP_M = 1e-4  # of the readings of the set-up
 MAX_SIZE = 4.0  # typical sizes: a larger error is a fault, or the specimen differs there
+WIENER_BAND_HZ, MIN_WIENER_LINES = 0.5, 9  # in which the power of a motion is averaged
 SLOPE_STEP = 0.1  # of a typical size, for the finite difference
 MIN_COLUMN_NORM = 1.0  # a nuisance that changes the residual by less at its typical size is dropped
 
@@ -275,12 +277,14 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
 
     Readings of their own would be regressors with errors: where the bumpers always touch, a force
     differs from K_j u + C_j u' by its noise alone, and its gain would be the one that explains this
-    noise. So forces and accelerations are those of the model and of the displacements.
+    noise. So forces and accelerations are those of the model and of the displacements, where these
+    exceed their noise: a resonance of a mounting grows with the square of the frequency.
     """
     signals, m = residuals.signals, residuals.motion()
     spectra, grid = dict(signals.spectra), signals.grid
     model = parameters.model_for_log(residuals.log_number, m)
-    forces = forces_along(model, m.u, m.v, m.table_acc, m.time_s, residuals.contact_state)
+    motion = (grid.apply_gain(values, _pass_motion(signals, m.u)) for values in (m.u, m.v))
+    forces = forces_along(model, *motion, m.table_acc, m.time_s, residuals.contact_state)
     damper, right, left = (grid.from_time_domain(np.nan_to_num(force)) for force in forces)
     if "damper_force_n" in spectra:
         spectra["damper_force_n"] = damper
@@ -300,6 +304,16 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     if {"table_acc_m_s2", "table_disp_m"} <= spectra.keys():
         spectra["table_acc_m_s2"] = square * signals.fuse_body("table")
     return replace(signals, spectra=spectra)
+
+
+def _pass_motion(signals: LogSignals, u: Float1D) -> Float1D:
+    """Return the gain of a Wiener filter of a displacement u in m (sample,), (frequency,)."""
+    hz = signals.omega / (2.0 * np.pi)
+    power = np.abs(signals.grid.from_time_domain(u) / signals.grid.decimation) ** 2 / u.size
+    power = uniform_filter1d(power, max(round(WIENER_BAND_HZ / hz[1]), MIN_WIENER_LINES))
+    # noise alone exceeds its mean in a band by chance
+    noise = 2.0 * signals.motion_density**2
+    return np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
 
 
 def sensor_mask(residuals: LogResiduals) -> Bool2D:
