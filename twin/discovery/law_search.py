@@ -148,7 +148,7 @@ def search_laws(
 ) -> list[FittedSet]:
     """Return the sets of a start and one or two terms that were fitted, best first.
 
-    Later starts are tried only if the earlier ones lead to no explanation.
+    Later starts are tried only if the earlier ones lead to no explanation, and to none as good.
     """
     # without load cells contact is unknown, not absent
     has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
@@ -160,7 +160,8 @@ def search_laws(
     ]
     fitted_sets: list[FittedSet] = []
     for start in starts:
-        if not _explains(problem, fitted_sets):
+        reached = min((fitted.cost for fitted in fitted_sets), default=math.inf)
+        if not _explains(problem, fitted_sets) and start.cost < reached:
             fitted_sets += _search_from(problem, start, library, report)
     if not _explains(problem, [*starts, *fitted_sets]):
         expressions = list_symbolic_candidates(problem.log_residuals, starts[0].fit.parameters)
@@ -177,12 +178,13 @@ def _search_from(
 ) -> list[FittedSet]:
     """Return the sets of `start` and one or two terms that were fitted."""
     fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
-    for current in fitted_sets[:BEAM_WIDTH]:
+    for current in [*fitted_sets[:BEAM_WIDTH]]:
         excess = start.cost - problem.expected_square
         if _explains(problem, fitted_sets) or start.cost - current.cost < MIN_FIRST_GAIN * excess:
             break
         further = [term for term in library if term.name not in current.names]
-        fitted_sets = [*fitted_sets, *_extend(problem, current, further, NEXT_REFITS, report)]
+        reached = min(fitted.cost for fitted in fitted_sets)
+        fitted_sets += _extend(problem, current, further, NEXT_REFITS, report, reached)
     best = min(fitted_sets, key=lambda fitted: fitted.cost, default=start)
     names = (*start.names, *best.names[-1:])
     if len(best.effects) == len(start.effects) + 2 and all(
@@ -205,12 +207,16 @@ def _extend(
     library: Sequence[Candidate],
     max_refits: int,
     report: ProgressCallback,
+    reached: float = math.inf,
 ) -> list[FittedSet]:
-    """Return the sets of `current` and the best screened terms, each refitted, best first."""
+    """Return the sets of `current` and the best screened terms, each refitted, best first.
+
+    Terms that promise far less than another set has `reached` are left out.
+    """
     parameters = current.fit.parameters
     equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
     fitted_sets: list[FittedSet] = []
-    screened_terms = select_promising(equations, max_refits)
+    screened_terms = select_promising(equations, max_refits, reached)
     for index, screened in enumerate(screened_terms, 1):
         effects = (*current.effects, screened.candidate)
         names = tuple(effect.name for effect in effects)

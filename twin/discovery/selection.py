@@ -355,13 +355,19 @@ def fit_generic_terms(problem: SelectionProblem, start: FittedSet) -> tuple[Fitt
     )
 
 
-def select_promising(equations: NormalEquations, max_count: int) -> list[ScreenedCandidate]:
-    """Return the best candidates, without those far worse than the first or with little gain."""
+def select_promising(
+    equations: NormalEquations, max_count: int, reached: float = math.inf
+) -> list[ScreenedCandidate]:
+    """Return the best candidates, without those with little gain or far worse than the first.
+
+    Or than a mean square that has been `reached` without them.
+    """
     ranked = rank_candidates(equations, max_count)
 
     def is_promising(indexed: tuple[int, ScreenedCandidate]) -> bool:
         index, screened = indexed
         hopeless = index >= MIN_REFITS and screened.cost > MAX_COST_RATIO * ranked[0].cost
+        hopeless = hopeless or screened.cost > MAX_COST_RATIO * reached
         return not hopeless and screened.cost <= (1.0 - MIN_PROMISED_GAIN) * equations.base_cost
 
     return [screened for _, screened in takewhile(is_promising, enumerate(ranked))]
