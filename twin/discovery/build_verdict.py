@@ -138,7 +138,9 @@ def build_verdict(
         },
         next_run=suggest_next_run(verdict.outcome, names, alternatives, blind_to),
         seconds=seconds,
-        held_out_logs=[_judge_held_out(log, discovery, given) for log in held_out_logs],
+        held_out_logs=[
+            _judge_held_out(log, discovery, given, proposal) for log in held_out_logs
+        ],
     )
 
 
@@ -236,10 +238,15 @@ def _list_nuisances(discovery: Discovery) -> list[FittedNuisance]:
     return sorted(fitted, key=lambda nuisance: -nuisance.typical)
 
 
-def _judge_held_out(log: PreparedLog, discovery: Discovery, given: Model | None) -> HeldOutLog:
-    """Return the errors of the damper force on a held-out log of every model, and the noise."""
-    null, best = discovery.selection.null.fit, discovery.verdict.best.fit
-    after = compute_force_error(log, best.parameters)
+def _judge_held_out(
+    log: PreparedLog, discovery: Discovery, given: Model | None, proposal: LawProposal | None
+) -> HeldOutLog:
+    """Return the errors of the damper force on a held-out log of every model, and the noise.
+
+    The last one is that of model.toml: with the proposed law, if there is one.
+    """
+    null, best = discovery.selection.null.fit, discovery.verdict.best
+    after = compute_force_error(log, (proposal.fitted if proposal else best).fit.parameters)
     as_given = given and compute_force_error(log, ParameterSet.from_model(given, 1))
     return HeldOutLog(
         log=log.signals.name,

@@ -159,7 +159,7 @@ class HeldOutLog(Contract):
     log: str = Field(description="name of the log")
     nrmse_given: Ratio = Field(None, description="of the model as given, not fitted")
     nrmse_before: Misfit = Field(description="of the model, refitted to the other logs")
-    nrmse_after: Misfit = Field(description="with the effects added")
+    nrmse_after: Misfit = Field(description="with what was found: effects, or the proposed law")
     noise_floor: Misfit = Field(
         math.nan, description="what the noise of the sensors alone would leave"
     )
