@@ -132,3 +132,35 @@ def test_a_fold_that_says_as_much_as_the_others_is_judged_as_least_squares_does(
         mine = fold == k
         best = np.linalg.lstsq(x[:, ~mine].T, y[~mine], rcond=None)[0]
         assert out[mine] == pytest.approx(best @ x[:, mine] - y[mine], abs=1e-6)
+
+
+class ToyReading(Toy):
+    """A line whose x is a reading: with its noise, and in a copy with the noise once more."""
+
+    def __init__(self, true: Float1D, y: Float1D, noise: float, copies: int = 1) -> None:
+        draws = [np.random.default_rng([8, k]).standard_normal(COUNT) for k in range(copies)]
+        self.true, self.y, self.noise, self.copies = true, y, noise, copies
+        x = true + noise * np.sum(draws, axis=0)
+        super().__init__(lambda a, b: a * x + b - y)
+
+    def with_noise_copy(self, copy: int) -> "ToyReading":
+        return ToyReading(self.true, self.y, self.noise, self.copies + 1)
+
+
+@pytest.mark.parametrize(("without_noise", "slope"), [(False, 1.6), (True, 2.0)])
+def test_a_slope_is_attenuated_by_the_noise_of_its_reading_unless_it_is_taken_off(
+    without_noise: bool, slope: float
+) -> None:
+    draw = np.random.default_rng(9)
+    true = draw.standard_normal(COUNT)
+    y = 2.0 * true + 0.1 * draw.standard_normal(COUNT)
+    sheet = cast(LogResiduals, ToyReading(true, y, 0.5))
+    fit = fit_parameters(
+        [sheet], ParameterSet({A: 0.5, B: 0.5}, (free(A), free(B))), folds=(np.arange(COUNT) % 3,),
+        without_noise=without_noise,
+    )  # fmt: skip
+    assert fit.values[A] == pytest.approx(slope, rel=0.05)
+    # a held-out third is judged by the same estimator
+    left = fit.values[A] * 0.5
+    expected = math.hypot(left, 0.1, (2.0 - slope) * 1.0)
+    assert float(fit.held_out[0].std()) == pytest.approx(expected, rel=0.1)

@@ -26,6 +26,7 @@ SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a paramete
 HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit
 MIN_SCATTER_BLOCKS = 10.0  # with fewer, their scatter alone may be too small by chance
 COLOUR_FACTOR = 1.5  # of the error within a contact: noise of the fused motion is not white there
+MAX_NOISE_SHARE = 0.5  # of the information on a parameter that is noise of the readings
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
 
@@ -78,16 +79,20 @@ def fit_parameters(
     train: Sequence[Bool2D] | None = None,
     folds: Sequence[Int1D] = (),
     mapper: MapFunction = map,
+    without_noise: bool = False,
 ) -> FitResult:
     """Fit the free parameters of `start` by least squares.
 
-    Use the entries where `train`, (entry,), is True; all without it.
+    Use the entries where `train`, (entry,), is True; all without it. `without_noise` corrects for
+    the errors of the readings in the slopes, which make a parameter too small: their products, as
+    a copy with more noise shows them, are taken off the normal equations (bias-compensated least
+    squares; Soderstrom, Errors-in-variables methods in system identification, 2018).
 
     With `folds`, (entry,) per log, also compute the cross-validation residual: that of each fold
     after refitting to the others, by one step from the full fit. Folds below zero are never held
     out.
     """
-    return _LevenbergMarquardt(log_residuals, start, train, folds, mapper).run()
+    return _LevenbergMarquardt(log_residuals, start, train, folds, mapper).run(without_noise)
 
 
 def fit_with_misfit(
@@ -96,17 +101,19 @@ def fit_with_misfit(
     folds: Sequence[Int1D] = (),
     mapper: MapFunction = map,
 ) -> FitResult:
-    """Fit as `fit_parameters`; where the model leaves more than noise, that counts as noise too.
+    """Fit without noise; where the model leaves more than noise, that counts as noise too.
 
     Else nuisances would run as far as lowers it, whatever their priors. The cost and the
     cross-validation residual of the result are over the noise alone nevertheless.
     """
-    fit = fit_parameters(log_residuals, start, folds=folds, mapper=mapper)
+    fit = fit_parameters(log_residuals, start, mapper=mapper)
     if not fit.free or fit.cost <= MAX_LEVEL * expected_level(log_residuals):
-        return fit
+        return fit_parameters(
+            log_residuals, fit.parameters, folds=folds, mapper=mapper, without_noise=True
+        )
     weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
     ratios = [new.weight / old.weight for new, old in zip(weighted, log_residuals, strict=True)]
-    fit = fit_parameters(weighted, start, folds=folds, mapper=mapper)
+    fit = fit_parameters(weighted, start, folds=folds, mapper=mapper, without_noise=True)
     entries = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
     held_out = tuple(
         np.where(residuals.entry_row < len(residuals.rows), ratio, 1.0) * values
@@ -180,6 +187,34 @@ def select_entries(entries: Sequence[Float1D], train: Sequence[Bool2D] | None) -
     return entries[0] if len(entries) == 1 else np.concatenate(entries)
 
 
+@dataclass(frozen=True, eq=False)
+class _NoiseProducts:
+    """Products of the noise of readings in slopes, (free, free), and residual, (free,), about x."""
+
+    x: Float1D
+    of_slopes: Float2D
+    with_residual: Float1D
+
+    def measure_share(self, x: Float1D) -> float:
+        """Return how much more of the residual squares at x is noise than at the centre."""
+        change = x - self.x
+        return float(change @ (2.0 * self.with_residual + self.of_slopes @ change))
+
+    def measure_gradient(self, x: Float1D) -> Float1D:
+        """Return half the slope of that share at x, (free,)."""
+        return self.with_residual + self.of_slopes @ (x - self.x)
+
+    def take_off(self, information: Float2D, share: float = 1.0) -> Float2D:
+        """Return information on the parameters, (free, free), without this share of the noise."""
+        if not self.of_slopes.any():
+            return information
+        return information - _limit_noise(share * self.of_slopes, information)
+
+    @classmethod
+    def none(cls, x: Float1D) -> "_NoiseProducts":
+        return cls(x, np.zeros((x.size, x.size)), np.zeros(x.size))
+
+
 class _LevenbergMarquardt:
     """One Levenberg-Marquardt fit; x are the internal values of the free parameters."""
 
@@ -194,6 +229,7 @@ class _LevenbergMarquardt:
         self.log_residuals, self.start, self.free = log_residuals, start, start.free
         self.folds, self.mapper = folds, mapper
         self.train = train
+        self.noise: _NoiseProducts | None = None
         self.count = sum(
             residuals.entry_row.size if train is None else int(train[log].sum())
             for log, residuals in enumerate(log_residuals)
@@ -223,15 +259,25 @@ class _LevenbergMarquardt:
             step[inside] = solve_damped(hessian[np.ix_(inside, inside)], damping, gradient[inside])
         return np.clip(x - step, self.low, self.high)
 
-    def run(self) -> FitResult:
+    def run(self, without_noise: bool) -> FitResult:
         x = np.clip(self.start.to_vector(), self.low, self.high)
+        jacobian = np.empty((x.size, self.count))
+        x, current, converged = self._descend(x, jacobian)
+        if without_noise and x.size:
+            self.noise = self._measure_noise(x, current, jacobian)
+            x, current, converged = self._descend(x, jacobian)
+        return self._build_result(x, current, jacobian, converged)
+
+    def _descend(self, x: Float1D, jacobian: Float2D) -> tuple[Float1D, list[Float1D], bool]:
+        """Return (parameters, residuals, True if converged) of least cost; fill their slopes."""
         current = self.evaluate(x)
         r = self.select_training(current)
-        cost, damping, converged = float(r @ r), 1e-4, not self.free
-        jacobian = np.empty((x.size, r.size))
         self.fill_jacobian(jacobian, x, current)
+        noise = self.noise or _NoiseProducts.none(x)
+        cost, damping, converged = float(r @ r) - noise.measure_share(x), 1e-4, not self.free
         for _ in range(0 if converged else MAX_ITERATIONS):
-            hessian, gradient = jacobian @ jacobian.T, jacobian @ r
+            hessian = noise.take_off(jacobian @ jacobian.T)
+            gradient = jacobian @ r - noise.measure_gradient(x)
             gain = 0.0
             for _ in range(8):
                 trial_x = self.take_step(x, hessian, gradient, damping)
@@ -239,9 +285,9 @@ class _LevenbergMarquardt:
                     break
                 trial_values = self.evaluate(trial_x)
                 trial_chosen = self.select_training(trial_values)
-                trial_cost = float(trial_chosen @ trial_chosen)
+                trial_cost = float(trial_chosen @ trial_chosen) - noise.measure_share(trial_x)
                 if trial_cost < cost:
-                    gain = (cost - trial_cost) / max(cost, 1e-300)
+                    gain = (cost - trial_cost) / max(abs(cost), 1e-300)
                     x, current, r, cost = trial_x, trial_values, trial_chosen, trial_cost
                     damping = max(damping / 10, 1e-9)
                     break
@@ -250,14 +296,30 @@ class _LevenbergMarquardt:
                 converged = True
                 break
             self.fill_jacobian(jacobian, x, current)
-        return self._build_result(x, current, jacobian, cost, converged)
+        return x, current, converged
+
+    def _measure_noise(
+        self, x: Float1D, current: Sequence[Float1D], jacobian: Float2D
+    ) -> _NoiseProducts:
+        """Return the products of the noise of the readings, from a copy that has it once more."""
+        copies = [residuals.with_noise_copy(0) for residuals in self.log_residuals]
+        parameters = self.start.with_vector(x)
+        noisy_values = [residuals.evaluate(parameters) for residuals in copies]
+        slopes = np.empty_like(jacobian)
+        fill_jacobian(copies, parameters, noisy_values, self.train, self.mapper, slopes)
+        slopes -= jacobian
+        r = self.select_training(noisy_values) - self.select_training(current)
+        products = _limit_noise(slopes @ slopes.T, jacobian @ jacobian.T)
+        return _NoiseProducts(x, products, slopes @ r)
 
     def _build_result(
-        self, x: Float1D, current: list[Float1D], jacobian: Float2D, cost: float, converged: bool
+        self, x: Float1D, current: list[Float1D], jacobian: Float2D, converged: bool
     ) -> FitResult:
         """Return the fit with standard errors from a sandwich estimator clustered by block."""
         parameters = self.start.with_vector(x)
-        hessian = jacobian @ jacobian.T
+        noise = self.noise or _NoiseProducts.none(x)
+        products = jacobian @ jacobian.T
+        hessian = noise.take_off(products)
         scale = _curvature_scale(hessian)
         # parameters at a bound are fixed there
         inner = np.flatnonzero((self.low < x) & (x < self.high))
@@ -268,6 +330,7 @@ class _LevenbergMarquardt:
         )
         inverse /= np.outer(scale, scale)
         r = self.select_training(current)
+        cost = float(r @ r)
         first, count = 0, 0
         scatter, rest_scatter = np.zeros_like(inverse), np.zeros_like(inverse)
         information = []  # of each block, (free, block)
@@ -300,7 +363,7 @@ class _LevenbergMarquardt:
         scatter *= count / max(count - len(self.free), 1)
         covariance = inverse @ (scatter + rest_scatter) @ inverse
         sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        block_counts = _count_effective_blocks(information, np.diag(hessian))
+        block_counts = _count_effective_blocks(information, np.diag(products))
         unit_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
         white_sd = unit_sd * math.sqrt(max(cost / max(self.count, 1), 1.0))
         divisor = np.where(sd > 0, sd, 1.0)  # before they are widened, which correlates nothing
@@ -365,15 +428,33 @@ class _LevenbergMarquardt:
             x = np.where(dropped, vanishing, x)
             current = self.evaluate(x)
         r = np.concatenate(current)
-        gradient = jacobian @ np.where(training, r, 0.0)
-        cost = float(r[training] @ r[training])
+        noise, share = self.noise or _NoiseProducts.none(x), float(training.mean())
+        gradient = jacobian @ np.where(training, r, 0.0) - share * noise.measure_gradient(x)
+        hessian = noise.take_off(hessian, share)
+        cost = float(r[training] @ r[training]) - share * noise.measure_share(x)
         gradient[undetermined], hessian[undetermined], hessian[:, undetermined] = 0.0, 0.0, 0.0
         for damping in HELD_OUT_DAMPINGS:
-            trial = self.evaluate(self.take_step(x, hessian, gradient, damping))
+            trial_x = self.take_step(x, hessian, gradient, damping)
+            trial = self.evaluate(trial_x)
             trial_r = np.concatenate(trial)[training]
-            if float(trial_r @ trial_r) <= cost:
+            if float(trial_r @ trial_r) - share * noise.measure_share(trial_x) <= cost:
                 return trial
         return current  # no step improves the training folds
+
+
+def _limit_noise(products: Float2D, information: Float2D) -> Float2D:
+    """Return the products of noise, at most `MAX_NOISE_SHARE` of the information everywhere.
+
+    In a direction that holds hardly more than noise a correction would be as uncertain.
+    """
+    scale = _curvature_scale(information)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    size = np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    whitened = vectors / size / scale[:, None]
+    shares, axes = np.linalg.eigh(whitened.T @ products @ whitened)
+    back = scale[:, None] * (vectors * size @ axes)
+    limited: Float2D = back * np.minimum(shares, MAX_NOISE_SHARE) @ back.T
+    return limited
 
 
 def _count_effective_blocks(information: Sequence[list[Float1D]], total: Float1D) -> Float1D:
@@ -407,7 +488,7 @@ def _widen_for_few_blocks(sd: Float1D, white_sd: Float1D, block_counts: Float1D)
 
 def _curvature_scale(hessian: Float2D) -> Float1D:
     """Return the root of the diagonal of the Hessian, (p,), used for scaling."""
-    curvature = np.sqrt(np.diag(hessian))
+    curvature = np.sqrt(np.maximum(np.diag(hessian), 0.0))  # rounding may be negative
     return np.where(curvature > 0, curvature, 1.0)
 
 

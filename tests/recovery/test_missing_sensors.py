@@ -1,0 +1,73 @@
+"""A laboratory without one of its accelerometers: what is left still gives the truth."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.studies.evidence.laboratory import Instruments, Specimen, StepTest, record, write_table
+from twin.discovery.discover import prepare_problem
+from twin.discovery.loading import load_logs
+from twin.discovery.nuisances import list_sizes, widen_intervals
+from twin.exchange.import_table import ImportOptions, import_table
+from twin.model.model import Model
+from twin.model.parameters import Parameters
+
+START = Model(Parameters(550.0, 36e3, 1100.0, 500e3, 900.0, 500e3, 900.0, 4e-3, 4e-3))
+SPECIMEN = Specimen(gap_mm=-1.0)
+PROFILE = """
+title = "laboratory"
+[specimen]
+mass_kg = 550.0
+gap_mm = {gap}
+[sweep]
+start_hz = {start}
+stop_hz = {stop}
+step_hz = {step}
+cycles = {cycles}
+measured_cycles = 4
+acceleration_g = 0.05
+[acquisition]
+rate_hz = 1000.0
+"""
+# Always in contact the damping of the bumpers and the lags of the readings look alike; in free
+# flight the mass still moves where the drive, and the record, has ended.
+CASES = {
+    "mass_acc_m_s2": (10.0, StepTest(1.6, 3.2, 0.8, 6)),
+    "table_acc_m_s2": (-1.0, StepTest(2.0, 8.0, 2.0, 10)),
+}
+
+
+@pytest.mark.parametrize("missing", CASES)
+def test_a_missing_accelerometer_biases_no_parameter(missing: str, tmp_path: Path) -> None:
+    gap_mm, test = CASES[missing]
+    specimen = Specimen(gap_mm=gap_mm)
+    columns = record(specimen, Instruments(missing=(missing,)), 5, test)
+    profile = tmp_path / "lab.toml"
+    profile.write_text(
+        PROFILE.format(
+            gap=gap_mm, start=test.start_hz, stop=test.stop_hz, step=test.step_hz,
+            cycles=test.cycles,
+        )
+    )  # fmt: skip
+    log = tmp_path / "log.mcap"
+    import_table(
+        write_table(columns, tmp_path / "log.csv"), log, ImportOptions(profile=profile, accept=True)
+    )
+    logs, _ = load_logs([log])
+    prepared = prepare_problem(logs, START)
+    problem = prepared.problem
+    fit = widen_intervals(prepared.first_fit, problem.log_residuals)
+    assert fit.cost < 1.2 * problem.expected_square
+    truth = {
+        "stiffness": specimen.k, "damping": specimen.c, "bumper_stiffness_r": specimen.kb,
+        "bumper_damping_r": specimen.cb,
+    }  # fmt: skip
+    for free in fit.free:
+        names = [getattr(key, "name", "") for key in free.keys]
+        true = next((truth[name] for name in names if name in truth), None)
+        if true is not None:
+            assert abs(fit.values[free.key] - true) < 3.0 * fit.std_errors[free.key], free.name
+            assert fit.std_errors[free.key] < 0.05 * true, free.name
+    for nuisance, size in list_sizes(problem.log_residuals[0], fit.parameters):
+        if nuisance.kind == "lag":
+            assert abs(size * nuisance.size) < 4e-4, nuisance
