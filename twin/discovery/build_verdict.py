@@ -138,9 +138,7 @@ def build_verdict(
         },
         next_run=suggest_next_run(verdict.outcome, names, alternatives, blind_to),
         seconds=seconds,
-        held_out_logs=[
-            _judge_held_out(log, discovery, given, proposal) for log in held_out_logs
-        ],
+        held_out_logs=[_judge_held_out(log, discovery, given, proposal) for log in held_out_logs],
     )
 
 

@@ -26,7 +26,7 @@ SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a paramete
 HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit
 MIN_SCATTER_BLOCKS = 10.0  # with fewer, their scatter alone may be too small by chance
 COLOUR_FACTOR = 1.5  # of the error within a contact: noise of the fused motion is not white there
-MAX_NOISE_SHARE = 0.5  # of the information on a parameter that is noise of the readings
+MAX_NOISE_SHARE = 0.9  # of the information on a parameter that is noise of the readings
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
 

@@ -566,6 +566,11 @@ class LogResiduals:
         ]
 
     @cached_property
+    def _louder_signals(self) -> LogSignals:
+        """Signals with the noise that comparisons of sensors have shown."""
+        return self.signals.with_louder_channels(self.noise_scale)
+
+    @cached_property
     def _row_noise(self) -> tuple[Float1D, ...]:
         """Rms noise of the entries of each row: a number, or (entry,); that of the readings.
 
@@ -573,8 +578,8 @@ class LogResiduals:
         """
         if self.fixed_noise is not None:
             return self.fixed_noise
-        m = self.motion()
-        rms = self.force_noise(m, self.signals.mass_kg)
+        louder = replace(self.motion(), noise=self._louder_signals.motion_noise)
+        rms = self.force_noise(louder, self.signals.mass_kg)
         if self.whitening is not None:
             rms[0] = 1.0
         # rows of rms 1 through a low pass are louder within its band
@@ -595,14 +600,21 @@ class LogResiduals:
             for name, each in zip(self.rows, noise, strict=True)
         )
 
+    @cached_property
+    def _entry_noise(self) -> Float1D:
+        """Rms noise of each entry but those at rest, (entry,)."""
+        sizes = [samples.size for samples in self._entry_samples]
+        return np.concatenate(
+            [np.broadcast_to(n, size) for n, size in zip(self._row_noise, sizes, strict=True)]
+        )
+
     def with_noise_copy(self, copy: int) -> "LogResiduals":
         """Return the residuals of the readings with noise once more; each `copy` has its own.
 
         The terms of the nuisances have no noise: they stay as they are.
         """
-        known = {name: self.noise_scale.get(name, 1.0) for name in self.rows}
-        signals = self.signals.add_noise(copy, known)
-        fixed = self.with_signals(signals)
+        noisy = self._louder_signals.add_noise(copy)
+        fixed = self.with_signals(replace(self.signals, spectra=noisy.spectra))
         return replace(fixed, fixed_noise=self._row_noise, fixed_mask=self.row_mask)
 
     def with_signals(self, signals: LogSignals) -> "LogResiduals":
@@ -624,12 +636,20 @@ class LogResiduals:
         """
         r = self.evaluate(parameters) * self.weight
         laws = np.zeros(r.size) if base is None else self.evaluate(base) * self.weight - r
-        scale = dict(self.noise_scale)
-        for row, name in enumerate(self.rows):
-            change = self._measure_change(row, r)
-            if change > 1.0:
-                scale[name] = scale.get(name, 1.0) * math.sqrt(change)
-        learned = replace(self, noise_scale=scale, nuisances=None)
+        # a sensor that others show to be louder is louder in the forces, too
+        sensors = [row for row, name in enumerate(self.rows) if name not in FORCE_ROWS]
+        forces = [row for row, name in enumerate(self.rows) if name in FORCE_ROWS]
+        learned, louder = replace(self, nuisances=None), np.ones(r.size)
+        for rows in (sensors, forces):
+            scale = dict(learned.noise_scale)
+            for row in rows:
+                change = learned._measure_change(row, r / louder)
+                if change > 1.0:
+                    name = self.rows[row]
+                    scale[name] = scale.get(name, 1.0) * math.sqrt(change)
+            learned = replace(learned, noise_scale=scale)
+            louder[: r.size - self._rest_entry_count] = learned._entry_noise / self._entry_noise
+        laws /= louder
         measured = learned.measured_entries * learned.weight
         squares = measured**2
         forms = laws[self.entry_row < len(self.rows)] ** 2
@@ -640,13 +660,8 @@ class LogResiduals:
         weight = math.sqrt(1.0 + sum(part / count for part, count in parts))
         terms = self.nuisances
         if terms is not None:
-            ratio = np.concatenate(
-                [
-                    np.full(samples.size, scale.get(name, 1.0) / self.noise_scale.get(name, 1.0))
-                    for name, samples in zip(self.rows, self._entry_samples, strict=True)
-                ]
-            )
-            terms = replace(terms, columns=(terms.columns / ratio).astype(np.float32))
+            columns = terms.columns / louder[: terms.columns.shape[1]]
+            terms = replace(terms, columns=columns.astype(np.float32))
         # a name must leave no more than instruments do, whatever form its law has
         expected = (1.0 + parts[0][0] / max(squares.size, 1)) / weight**2
         return replace(learned, weight=weight, expected_square=expected, nuisances=terms)
@@ -699,7 +714,7 @@ class LogResiduals:
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
-        p, signals = self.reference.parameters, self.signals
+        p, signals = self.reference.parameters, self._louder_signals
         k, c = (
             (p.stiffness, p.damping),
             (p.bumper_stiffness_r, p.bumper_damping_r),

@@ -213,20 +213,26 @@ class LogSignals:
         slow = self.surface_noise_m * math.sqrt(count * 0.5 * rate_hz / self.band_hz)
         return np.hypot(density, slow)
 
-    def add_noise(self, copy: int, scale: Mapping[str, float]) -> "LogSignals":
-        """Return the signals with noise of the known density added to every channel.
+    @property
+    def motion_noise(self) -> MotionNoise:
+        """Rms noise of the motion and of the forces, SI."""
+        return self._fusion.motion_noise
 
-        `scale` is the noise that the rows of sensors have shown over that density.
-        """
+    def with_louder_channels(self, scale: Mapping[str, float]) -> "LogSignals":
+        """Return the signals with the noise that the rows of sensors show, over that known."""
         louder = dict.fromkeys(self.channels, 1.0)
         for row, channels in {**SENSOR_PAIRS, **CELL_PAIRS}.items():
             for channel in channels:
                 if channel in louder:
                     louder[channel] = max(louder[channel], scale.get(row, 1.0))
+        return replace(self, noise={c: louder[c] * noise for c, noise in self.noise.items()})
+
+    def add_noise(self, copy: int) -> "LogSignals":
+        """Return the signals with noise of the known density added to every channel."""
         rng = np.random.default_rng([NOISE_SEED, copy])
         spectra = {}
         for channel in self.channels:
-            density = louder[channel] * self.noise[channel] * math.sqrt(0.5 * self.grid.size)
+            density = self.noise[channel] * math.sqrt(0.5 * self.grid.padded_size)
             parts = rng.standard_normal((2, density.size))
             spectra[channel] = self.spectra[channel] + density * (parts[0] + 1j * parts[1])
         return replace(self, spectra=spectra)
