@@ -86,8 +86,8 @@ def test_rubber_bearings_have_hysteresis_and_more() -> None:
 
     discovery = discover_effects([bearing("ICA50"), bearing("ICA140")], oscillator(5.0, 0.5))
     verdict = discovery.verdict
-    assert verdict.best.names[0] == "bouc_wen"
-    assert verdict.outcome == "named"
+    assert "bouc_wen" in verdict.best.names
+    assert verdict.outcome == "unexplained"  # it leaves more than noise, as is known of it
     assert discovery.localization.channels == ("damper_force_n",)
     low, high = discovery.localization.frequency_hz or (0.0, 0.0)
     assert 0.1 < low < high < 2.0  # the first mode of the building on its bearings
