@@ -281,7 +281,7 @@ def test_an_effect_is_named_only_where_its_absence_is_excluded(none: float, outc
     selection = replace(named, explanations=explanations)
     verdict = judge_selection(discovery.prepared.problem, selection, named.best.cost)
     assert verdict.outcome == outcome
-    assert verdict.confidence == pytest.approx(1.0 - none)
+    assert verdict.effects_confidence == pytest.approx(1.0 - none)
 
 
 def test_a_stranger_beside_no_effect_is_unexplained_in_its_place() -> None:

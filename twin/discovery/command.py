@@ -36,7 +36,7 @@ from twin.discovery.words import (
     describe_proposal,
     describe_sensors,
     format_interval,
-    format_percent,
+    format_share,
     format_verdict,
 )
 from twin.report.finalize import EXIT_INTERRUPTED
@@ -230,7 +230,7 @@ def print_verdict(verdict: Verdict) -> None:
     """Print the verdict, the misfit, the fitted parameters and the notes."""
     print_line(f"{verdict.verdict}: {format_verdict(verdict)}")
     certainty = (
-        "" if verdict.confidence is None else f" (probability {format_percent(verdict.confidence)})"
+        "" if verdict.confidence is None else f" (probability {format_share(verdict.confidence)})"
     )
     print_line(f"  {verdict.why}{certainty}")
     misfit = verdict.gap

@@ -216,7 +216,7 @@ def _extend(
     parameters = current.fit.parameters
     equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
     fitted_sets: list[FittedSet] = []
-    screened_terms = select_promising(equations, max_refits, reached)
+    screened_terms = select_promising(equations, max_refits, reached / max(current.cost, 1e-300))
     for index, screened in enumerate(screened_terms, 1):
         effects = (*current.effects, screened.candidate)
         names = tuple(effect.name for effect in effects)

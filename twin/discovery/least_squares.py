@@ -26,6 +26,7 @@ SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a paramete
 HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit
 MIN_SCATTER_BLOCKS = 10.0  # with fewer, their scatter alone may be too small by chance
 COLOUR_FACTOR = 1.5  # of the error within a contact: noise of the fused motion is not white there
+MAX_DEPARTURE_SHARE = 0.1  # of the squares of a step: with more the model is not linear there
 MAX_NOISE_SHARE = 0.9  # of the information on a parameter that is noise of the readings
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
@@ -195,11 +196,6 @@ class _NoiseProducts:
     of_slopes: Float2D
     with_residual: Float1D
 
-    def measure_share(self, x: Float1D) -> float:
-        """Return how much more of the residual squares at x is noise than at the centre."""
-        change = x - self.x
-        return float(change @ (2.0 * self.with_residual + self.of_slopes @ change))
-
     def measure_gradient(self, x: Float1D) -> Float1D:
         """Return half the slope of that share at x, (free,)."""
         return self.with_residual + self.of_slopes @ (x - self.x)
@@ -261,23 +257,13 @@ class _LevenbergMarquardt:
 
     def run(self, without_noise: bool) -> FitResult:
         x = np.clip(self.start.to_vector(), self.low, self.high)
-        jacobian = np.empty((x.size, self.count))
-        x, current, converged = self._descend(x, jacobian)
-        if without_noise and x.size:
-            self.noise = self._measure_noise(x, current, jacobian)
-            x, current, converged = self._descend(x, jacobian)
-        return self._build_result(x, current, jacobian, converged)
-
-    def _descend(self, x: Float1D, jacobian: Float2D) -> tuple[Float1D, list[Float1D], bool]:
-        """Return (parameters, residuals, True if converged) of least cost; fill their slopes."""
         current = self.evaluate(x)
         r = self.select_training(current)
+        cost, damping, converged = float(r @ r), 1e-4, not self.free
+        jacobian = np.empty((x.size, r.size))
         self.fill_jacobian(jacobian, x, current)
-        noise = self.noise or _NoiseProducts.none(x)
-        cost, damping, converged = float(r @ r) - noise.measure_share(x), 1e-4, not self.free
         for _ in range(0 if converged else MAX_ITERATIONS):
-            hessian = noise.take_off(jacobian @ jacobian.T)
-            gradient = jacobian @ r - noise.measure_gradient(x)
+            hessian, gradient = jacobian @ jacobian.T, jacobian @ r
             gain = 0.0
             for _ in range(8):
                 trial_x = self.take_step(x, hessian, gradient, damping)
@@ -285,9 +271,9 @@ class _LevenbergMarquardt:
                     break
                 trial_values = self.evaluate(trial_x)
                 trial_chosen = self.select_training(trial_values)
-                trial_cost = float(trial_chosen @ trial_chosen) - noise.measure_share(trial_x)
+                trial_cost = float(trial_chosen @ trial_chosen)
                 if trial_cost < cost:
-                    gain = (cost - trial_cost) / max(abs(cost), 1e-300)
+                    gain = (cost - trial_cost) / max(cost, 1e-300)
                     x, current, r, cost = trial_x, trial_values, trial_chosen, trial_cost
                     damping = max(damping / 10, 1e-9)
                     break
@@ -296,7 +282,28 @@ class _LevenbergMarquardt:
                 converged = True
                 break
             self.fill_jacobian(jacobian, x, current)
-        return x, current, converged
+        if without_noise and x.size:
+            x, current = self._take_off_noise(x, current, jacobian)
+        return self._build_result(x, current, jacobian, converged)
+
+    def _take_off_noise(
+        self, x: Float1D, current: list[Float1D], jacobian: Float2D
+    ) -> tuple[Float1D, list[Float1D]]:
+        """Return (parameters, residuals) after the step that noise in the slopes has held back.
+
+        It is a step of the linear model: shorter where the residuals do not follow that.
+        """
+        self.noise = noise = self._measure_noise(x, current, jacobian)
+        r = self.select_training(current)
+        hessian = noise.take_off(jacobian @ jacobian.T)
+        gradient = jacobian @ r - noise.with_residual
+        for damping in HELD_OUT_DAMPINGS:
+            trial_x = self.take_step(x, hessian, gradient, damping)
+            trial = self.evaluate(trial_x)
+            if _is_linear(r, (trial_x - x) @ jacobian, self.select_training(trial)):
+                self.fill_jacobian(jacobian, trial_x, trial)
+                return trial_x, trial
+        return x, current
 
     def _measure_noise(
         self, x: Float1D, current: Sequence[Float1D], jacobian: Float2D
@@ -431,15 +438,23 @@ class _LevenbergMarquardt:
         noise, share = self.noise or _NoiseProducts.none(x), float(training.mean())
         gradient = jacobian @ np.where(training, r, 0.0) - share * noise.measure_gradient(x)
         hessian = noise.take_off(hessian, share)
-        cost = float(r[training] @ r[training]) - share * noise.measure_share(x)
+        cost = float(r[training] @ r[training])
         gradient[undetermined], hessian[undetermined], hessian[:, undetermined] = 0.0, 0.0, 0.0
         for damping in HELD_OUT_DAMPINGS:
             trial_x = self.take_step(x, hessian, gradient, damping)
             trial = self.evaluate(trial_x)
             trial_r = np.concatenate(trial)[training]
-            if float(trial_r @ trial_r) - share * noise.measure_share(trial_x) <= cost:
+            moved = ((trial_x - x) @ jacobian)[training]
+            is_fit = float(trial_r @ trial_r) <= cost
+            if is_fit or (self.noise and _is_linear(r[training], moved, trial_r)):
                 return trial
         return current  # no step improves the training folds
+
+
+def _is_linear(r: Float1D, moved: Float1D, trial: Float1D) -> bool:
+    """Return True if a residual r changes to `trial` nearly as the linear model has `moved` it."""
+    departure = trial - r - moved
+    return float(departure @ departure) <= MAX_DEPARTURE_SHARE * float(moved @ moved)
 
 
 def _limit_noise(products: Float2D, information: Float2D) -> Float2D:

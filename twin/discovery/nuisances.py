@@ -283,8 +283,9 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     signals, m = residuals.signals, residuals.motion()
     spectra, grid = dict(signals.spectra), signals.grid
     model = parameters.model_for_log(residuals.log_number, m)
-    motion = (grid.apply_gain(values, _pass_motion(signals, m.u)) for values in (m.u, m.v))
-    forces = forces_along(model, *motion, m.table_acc, m.time_s, residuals.contact_state)
+    gain = _pass_motion(signals, m.u)
+    u, v = grid.apply_gain(m.u, gain), grid.apply_gain(m.v, gain)
+    forces = forces_along(model, u, v, m.table_acc, m.time_s, residuals.contact_state)
     damper, right, left = (grid.from_time_domain(np.nan_to_num(force)) for force in forces)
     if "damper_force_n" in spectra:
         spectra["damper_force_n"] = damper

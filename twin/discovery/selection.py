@@ -360,14 +360,14 @@ def select_promising(
 ) -> list[ScreenedCandidate]:
     """Return the best candidates, without those with little gain or far worse than the first.
 
-    Or than a mean square that has been `reached` without them.
+    Or than what has been `reached` without them, over the mean square before.
     """
     ranked = rank_candidates(equations, max_count)
 
     def is_promising(indexed: tuple[int, ScreenedCandidate]) -> bool:
         index, screened = indexed
         hopeless = index >= MIN_REFITS and screened.cost > MAX_COST_RATIO * ranked[0].cost
-        hopeless = hopeless or screened.cost > MAX_COST_RATIO * reached
+        hopeless = hopeless or screened.cost > MAX_COST_RATIO * reached * equations.base_cost
         return not hopeless and screened.cost <= (1.0 - MIN_PROMISED_GAIN) * equations.base_cost
 
     return [screened for _, screened in takewhile(is_promising, enumerate(ranked))]

@@ -266,7 +266,7 @@ def _generalize(kind: str) -> str:
     return "slow_offset" if kind.startswith("offset") and kind != "offset" else kind
 
 
-def format_percent(share: float) -> str:
+def format_share(share: float) -> str:
     """Format a share or probability in percent, near 0 and 1 as a bound."""
     if 0.0 < share < LEAST_SHARE:
         return f"< {100 * LEAST_SHARE:g} %"
