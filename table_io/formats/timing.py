@@ -23,6 +23,7 @@ INTERVAL_SPREAD = 0.01  # relative, of the steps of a column of times without a 
 MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 1e6  # of a test on a table or a component
 MAX_PAUSES = 10  # in the notes
 PAUSE_SAMPLES = 10  # from which a gap is a pause, after which the clock may stand elsewhere
+MAX_APART_S = 1e4  # of two columns of times that may be those of different channels
 HOUR_S = 3600.0  # by which local clocks are moved for summer time
 SAMPLE_UNIT = "sample"  # of a column that counts samples; its rate is stated
 MIN_PLAIN_RATE_HZ = 0.5  # below it a step without a unit is hardly in seconds
@@ -78,6 +79,29 @@ def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
                 _measure_gaps(table.read_column(name), table)
             except InputError as error:
                 return f"column {name!r}: {error.where.rpartition(': ')[2]}: {error.problem}"
+    return ""
+
+
+def describe_other_times(table: ForeignTable, names: Sequence[str], chosen: str) -> str:
+    """Return how the times of another column differ from those chosen, "" if none do.
+
+    A column of dates next to one of seconds differs by years.
+    """
+    units = {name: find_stated_unit(name, table.columns[name].unit) for name in names}
+    first = TIME_UNITS.get(units[chosen], 1.0) * table.read_column(chosen)
+    for name in names:
+        is_time = name != chosen and find_quantity(name, table.columns[name].unit) == "time"
+        if not is_time or table.columns[name].size != first.size:
+            continue
+        times = TIME_UNITS.get(units[name] or units[chosen], 1.0) * table.read_column(name)
+        apart = np.abs(times - first)
+        step = float(np.median(np.diff(first)))
+        most_s = float(np.nanmax(apart))
+        if MAX_JITTER_SAMPLES * step < most_s < MAX_APART_S and (np.diff(times) > 0).all():
+            return (
+                f"columns {chosen!r} and {name!r} are different times, up to {most_s:.4g} s apart: "
+                "do the channels have one clock?"
+            )
     return ""
 
 

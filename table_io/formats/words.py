@@ -35,7 +35,7 @@ FACT_NAMES = {
 }
 NUMBER = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"
 QUANTITY_WORDS = {
-    "time": {"t", "time", "timestamp", "elapsed", "zeit", "tempo"},
+    "time": {"t", "time", "timestamp", "elapsed", "zeit", "tempo", "temps", "tiempo"},
     "displacement": {
         "x", "u", "d", "disp", "displ", "displacement", "dist", "distance", "pos", "position",
         "laser", "lvdt", "stroke", "deformation", "elongation", "spostamento", "weg",

@@ -148,11 +148,9 @@ def test_import_table_refuses_open_units_of_a_saved_map(tmp_path: Path) -> None:
     card = tmp_path / "map.toml"
     with pytest.raises(SystemExit):
         app(["import", str(table), "--save-map", str(card)])
-    assert set(ImportOptions(columns=card).read_map().columns) == {
-        "time_s",
-        "rel_disp_m",
-        "damper_force_n",
-    }  # type: ignore[union-attr]
+    column_map = ImportOptions(columns=card).read_map()
+    assert column_map is not None
+    assert {*column_map.columns} == {"time_s", "rel_disp_m", "damper_force_n"}
     with raises_input_error(key="columns", allowed="kip"):
         import_table(table, tmp_path / "a.mcap", ImportOptions(columns=card))
     with raises_input_error(where=table, problem="stroke", remedy="--save-map"):

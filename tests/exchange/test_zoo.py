@@ -171,6 +171,13 @@ GOOD: dict[str, str | bytes] = {
     "inch_kip.csv": with_scales("Time (sec),Disp (in),Force (kips)", 1 / 25.4, 1 / 4448.2216152605),
     "pound.csv": with_scales("Time (sec),Stroke (inch),Load (lbs)", 1 / 25.4, 1 / 4.4482216152605),
     "kgf.csv": with_scales("Time (s),Disp (cm),Force (kgf)", 0.1, 1 / 9.80665),
+    "one_clock_twice.csv": text(
+        "Time 1 (s),Disp (mm),Time 2 (s),Force (N)", ((t, u, t, f) for t, u, f in ROWS)
+    ),
+    "date_and_time.csv": text(
+        "Time (s),Epoch time (s),Disp (mm),Force (N)",
+        ((t, 1774742399.5 + t, u, f) for t, u, f in ROWS),
+    ),
     "ms.csv": with_times("Time (ms),Disp (mm),Force (N)", 1e3 * TIME),
     "minutes.csv": with_times("Time [min],Disp [mm],Force [N]", TIME / 60),
     "hours.csv": with_times("Time [h],Disp [mm],Force [N]", TIME / 3600),
@@ -233,6 +240,13 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     ),
     "backwards.csv": (text("Time (s),Disp (mm),Force (N)", reversed(ROWS)), "time"),
     "twice.csv": (text("Time (s),Disp (mm),Force (N)", [*ROWS, *ROWS]), "time must rise"),
+    "two_clocks.csv": (
+        text(
+            "Time 1 (s),Disp (mm),Time 2 (s),Force (N)",
+            ((t, u, t + 0.25, f) for t, u, f in ROWS),
+        ),
+        "'Time 1 (s)' and 'Time 2 (s)' are different times, up to 0.25 s apart",
+    ),
     "counts.csv": (with_times("No,Disp (mm),Force (N)", 1.0 + COUNTS), "rate"),
     "sample_numbers.csv": (with_times("Time,Disp (mm),Force (N)", COUNTS), "counts"),
     "ms_unstated.csv": (with_times("Time,Disp (mm),Force (N)", 1e3 * TIME), "ms"),

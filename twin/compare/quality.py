@@ -65,6 +65,7 @@ MAX_TAKEN_SHARE = 0.1  # of the work done by a force: work taken, by a force tha
 UNIT_FACTORS = (9.80665, 1000.0, 25.4, 2.54, 100.0, 39.3701, 386.089, 980.665, 9806.65, 10.0)
 MAX_FACTOR_ERROR = 0.05  # of gains of sensors, which are off by less
 MIN_LOSS = 0.01  # of the force: smaller work is that of sensors
+MIN_SIDE_CORRELATION = 0.3  # of the force of a bumper with the displacement towards it
 MIN_REVERSED_PULL = 5.0  # of a load cell, over its push
 COMPARED_PAIRS = (  # displacement, the channels (with signs) that are its second derivative
     ("table_disp_m", {"table_acc_m_s2": 1.0}),
@@ -590,20 +591,15 @@ def _list_swapped_sides(channels: Mapping[str, Float1D], _: float) -> Iterator[C
         u = channels["mass_disp_m"] - channels["table_disp_m"]
     else:
         return
-    places = {}
-    for side, cells in (("right", RIGHT_CELLS), ("left", LEFT_CELLS)):
+    sides = []
+    for cells in (RIGHT_CELLS, LEFT_CELLS):
         forces = [channels[cell] for cell in cells if cell in channels]
         force = np.sum(forces, axis=0) if forces else np.zeros(u.size)
         used = np.isfinite(force) & np.isfinite(u)
-        if not forces or not used.any():
+        if not used.any() or force[used].std() == 0.0:
             return
-        noise = 10.0 * float(np.median(np.abs(np.diff(force[used]))))
-        loaded = used & (force > max(noise, 0.2 * float(np.nanmax(force))))
-        if not loaded.any():
-            return
-        middle = float(np.median(u[used]))
-        places[side] = float(np.mean(u[loaded]) - middle) / float(np.std(u[used]))
-    if places["right"] < -0.3 and places["left"] > 0.3:
+        sides.append(float(np.corrcoef(force[used], u[used])[0, 1]))
+    if sides[0] < -MIN_SIDE_CORRELATION and sides[1] > MIN_SIDE_CORRELATION:
         yield ChannelDoubt(
             "swapped",
             tuple(cell for cell in (*RIGHT_CELLS, *LEFT_CELLS) if cell in channels),

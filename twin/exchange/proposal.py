@@ -18,6 +18,7 @@ from table_io.formats.timing import (
     MAX_INTERVAL_ERROR,
     SAMPLE_UNIT,
     check_rate,
+    describe_other_times,
     describe_unusable_times,
     find_time_column,
     judge_time_unit,
@@ -169,7 +170,8 @@ def propose_map(
         judged = judge_time_unit(table, time_column, stated.get("rate_hz"))
         unit = OPEN_UNIT if judged.question else judged.unit
         columns.append(ProposedColumn(TIME_COLUMN, time_column, unit, judged.reason))
-        questions += [judged.question] if judged.question else []
+        others = "" if judged.question else describe_other_times(table, names, time_column)
+        questions += [question for question in (judged.question, others) if question]
     for channel, name in sorted(chosen.items(), key=lambda item: [*known.channels].index(item[0])):
         unit, reason, question = _propose_unit(table, channel, name, chosen, known)
         columns.append(ProposedColumn(channel, name, OPEN_UNIT if question else unit, reason))
