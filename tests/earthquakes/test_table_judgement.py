@@ -284,6 +284,16 @@ def test_five_seconds_are_refused_and_a_sound_log_is_not() -> None:
         check_motion(NamedMotion("run", motion))
 
 
+def test_the_peaks_of_a_late_sine_are_no_clipping() -> None:
+    """Rounded to 16 bits, a slow sine stays at its extreme value for many samples."""
+    times = np.arange(round(60.0 * RATE_HZ)) / RATE_HZ
+    command, table = (
+        np.round(0.02 * np.sin(math.tau * 0.5 * (times - late)) / 3e-6) * 3e-6
+        for late in (0.0, 0.06)
+    )
+    check_motion(name_motion(command, table))
+
+
 def test_the_band_ends_where_noise_begins() -> None:
     log = make_log(1, lambda command, seed: play_table(command, seed, 0.0, noise_m=5e-4))
     low_hz, high_hz = find_predictable_band([log])

@@ -50,16 +50,20 @@ OCTAVE, THIRD_OCTAVE = 2.0, 2.0 ** (1.0 / 3.0)
 MIN_COHERENCE = 0.3
 MAX_FOREIGN_SHARE = 0.5  # of the power of the table's acceleration that is not the command's
 RESONANT_WIDTH_HZ = 0.5  # on either side of a peak that is no command's
+MAX_HYDRAULIC_S = 180.0  # of logs to which the hydraulic table is fitted, at half a second each
 PART_COUNT = 4  # of a single log, that are left out in turn
 MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler structure is not worse up to this
 MIN_CLIPPED_SAMPLES, MIN_CLIPPED_PARTS = 4, 2  # equal samples at an extreme, and how often
-MOVING_SHARE = 0.01  # of its peak by which the other signal moves while one is clipped
+# Of its peak by which the other signal goes beyond both ends of such a part. At the extreme of a
+# sine a late one moves by some percent, but to one side.
+MOVING_SHARE = 0.01
 CLIPPING_TOLERANCE = 1e-4  # of the range, round an extreme: a clipped signal may carry noise
 MIN_HELD_S = 0.5  # of one value while the other signal moves
 MIN_CORRELATION = 0.7  # of channels of one motion, by size: less says nothing of sign and lag
 MAX_LAG_S, SEARCHED_LAG_S = 0.5, 5.0  # of a slow table, and of a log on two clocks
 GAIN_LIMITS = 0.2, 5.0  # of displacement over command
 ACCELEROMETER_LIMITS = 0.7, 1.4  # of acceleration over the derivative of the displacement
+DERIVATIVE_BAND_HZ = 0.3, 10.0  # of a displacement, with little noise
 ACCELEROMETER_BAND_HZ = 0.8, 5.0  # where both are usually well above their noise
 MAX_ERROR = 1e3  # that is stated: a twin that diverges
 
@@ -89,7 +93,9 @@ def check_motion(named: NamedMotion) -> None:
             raise InputError("does not change: the table rests", where=log, key=channel)
     others = {"table_disp_m": (displacement, command), "drive_disp_m": (command, displacement)}
     if motion.has_accelerometer:
-        others["table_acc_m_s2"] = (motion.acceleration_m_s2, command)
+        projection = BandProjection(command.size, motion.rate_hz, DERIVATIVE_BAND_HZ)
+        derived = projection.to_samples(projection.differentiate(displacement))
+        others["table_acc_m_s2"] = (motion.acceleration_m_s2, derived)
     for channel, (row, other) in others.items():
         _check_saturation(log, channel, row, other, motion.rate_hz)
     correlation, lag_s = _correlate(command, displacement, motion.rate_hz)
@@ -124,15 +130,18 @@ def _check_saturation(log: str, channel: str, row: Float1D, other: Float1D, rate
     """Raise InputError if a signal stays at a value, or at an extreme, while another one moves."""
 
     def list_parts(stays: npt.NDArray[np.bool_], least: float) -> list[int]:
-        """Return the first samples of parts in which one stays and the other moves."""
+        """Return the first samples of parts in which one stays and the other goes and returns."""
         edges = np.diff(np.concatenate([[0], stays.astype(int), [0]]))
         parts = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
         limit = MOVING_SHARE * np.abs(other).max()
-        return [
-            int(start)
-            for start, end in parts
-            if end - start >= least and np.ptp(other[start:end]) > limit
-        ]
+        moving = []
+        for start, end in parts:
+            part = other[start:end]
+            ends = sorted((part[0], part[-1]))
+            beyond = max(part.max() - ends[1], ends[0] - part.min())
+            if end - start >= least and beyond > limit:
+                moving.append(int(start))
+        return moving
 
     tolerance = CLIPPING_TOLERANCE * np.ptp(row)
     clipped = [
@@ -363,11 +372,16 @@ def choose_structure(trials: Sequence[StructureTrial]) -> StructureTrial:
 def join_motions(logs: Sequence[NamedMotion]) -> TableRehearsal | None:
     """Return the motions of logs one after the other, each from rest to rest.
 
-    None if they have no accelerometer or different sampling rates.
+    None if they have no accelerometer, different sampling rates, or more than MAX_HYDRAULIC_S.
     """
     motions = [log.motion for log in logs]
-    is_joined = len({motion.rate_hz for motion in motions}) == 1
-    if not is_joined or not all(motion.has_accelerometer for motion in motions):
+    rates_hz = {motion.rate_hz for motion in motions}
+    seconds = sum(motion.command_m.size / motion.rate_hz for motion in motions)
+    if (
+        len(rates_hz) > 1
+        or seconds > MAX_HYDRAULIC_S
+        or not all(motion.has_accelerometer for motion in motions)
+    ):
         return None
     command, displacement, acceleration, reaction = (
         np.concatenate(rows)
