@@ -11,11 +11,12 @@ from tests.recovery.recordings import log_columns, oscillator
 from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
 from twin.discovery.discover import discover_effects, prepare_problem
-from twin.discovery.law_search import propose_law, search_laws
+from twin.discovery.law_search import propose_law, search_laws, select_law
 from twin.discovery.law_terms import FAMILIES, LAW_PREFIX, list_law_candidates
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import EffectKey
 from twin.discovery.symbolic_regression import make_term
+from twin.laws.effect_file import format_effect_file
 from twin.laws.expression import parse_unit
 
 
@@ -180,6 +181,12 @@ def test_a_term_that_stood_in_for_another_is_dropped(monkeypatch):
     assert fitted["mass"] == pytest.approx(truth["mass"], rel=0.02)
     held = (2 * math.pi * truth["frequency"]) ** 2 + truth["coupling"] / truth["mass"]
     assert fitted["omega2"] == pytest.approx(held, rel=0.02)
+    stand_in = [each for each in fitted_sets if each.names == ("law_resonator",)]
+    proposal = select_law(prepared.problem, [null], stand_in, 1.0, "")
+    assert proposal is not None
+    (law,) = proposal.laws  # its state has the letter of the table's position
+    assert {name for name, *_ in law.valid_range} == {"a", "v"} & law.used_names
+    assert 'id = "law_resonator"' in format_effect_file(law)
 
 
 def test_a_law_that_diverges_on_the_record_is_a_bad_fit_and_no_error():

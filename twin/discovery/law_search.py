@@ -285,7 +285,9 @@ def _describe_law(
         law,
         parameters=tuple(parameters),
         valid_range=tuple(
-            (name, *ends) for name, ends in valid_range.items() if name in law.used_names
+            (name, *ends)
+            for name, ends in valid_range.items()
+            if name in law.used_names & law.variables.keys()  # a state may have the same letter
         ),
         confused_with=(nearest,) if nearest else (),
         residual=f"A {law.title or 'law'} found where no effect of the library fits.",
