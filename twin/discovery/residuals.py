@@ -628,7 +628,7 @@ class LogResiduals:
 
         What does not repeat between the cycles of a step is noise, also where neither the rest nor
         a quiet band shows it: half the mean square of the difference of successive cycles, less
-        what the motion itself did not repeat, the lower quartile over the steps. And instruments
+        what the motion itself did not repeat, the median over the steps. And instruments
         err by a
         share of the force in ways of which no nuisance is a form, the same in every cycle, as do
         the forms of the laws that the model has beside its `base`, of their own force: the weight
@@ -710,7 +710,7 @@ class LogResiduals:
                 square, force_square = np.nanmean(table**2, axis=(1, 2))
                 share = changed_force / max(force_square, 1e-300)
                 variances.append(changed - CHANGE_ORDER**2 * share * square)
-        return float(np.percentile(variances, 25)) if variances else 1.0
+        return float(np.median(variances)) if variances else 1.0
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
