@@ -28,7 +28,7 @@ def table(path: Path, *columns: int) -> np.ndarray:
 
 def simulate_displacement(model: Model, acceleration: np.ndarray, rate_hz: float) -> np.ndarray:
     """u at the samples of an input that is band-limited: Runge-Kutta between them."""
-    p, k3 = model.parameters, model.effect_parameter("cubic_stiffness", "k3") or 0.0
+    p, k3 = model.parameters, model.coefficients.get("k3", 0.0)
     parts = 8
     a, h = resample_poly(acceleration, parts, 1), 1.0 / rate_hz / parts
 
