@@ -61,7 +61,7 @@ MIN_CHANGES = 8  # values of a step that show the noise
 CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
-MAX_SAMPLES = 80_000  # moving samples of all logs together; limits time and memory
+MAX_SAMPLES = 120_000  # moving samples of all logs together; limits time and memory
 
 
 @dataclass(frozen=True, slots=True)
