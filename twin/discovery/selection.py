@@ -147,6 +147,21 @@ class SelectionProblem:
         ]
         return mean_square(rows)
 
+    def measure_noise(self, fitted: FittedSet) -> float:
+        """Return the mean square in motion that the noise of the readings leaves of a model.
+
+        It is that of the model itself: where a law is steep, as friction at the reversal of a
+        motion, the noise of the motion is louder than in any other model.
+        """
+        parameters = fitted.fit.parameters
+        rows = [
+            (each.with_noise_copy(0).evaluate(parameters) - each.evaluate(parameters))[
+                each.entry_row < len(each.rows)
+            ]
+            for each in self.log_residuals
+        ]
+        return mean_square(rows)
+
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""
         rows: dict[str, list[Float1D]] = {}

@@ -70,7 +70,8 @@ def judge_selection(
     by_set = sum_by_set(selection.explanations)
     probability = by_set.get(frozenset(best.names), 0.0)
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
-    remains = problem.measure_level(best) > MAX_LEVEL * max(problem.expected_square, floor)
+    noise = max(problem.expected_square, problem.measure_noise(best), floor)
+    remains = problem.measure_level(best) > MAX_LEVEL * noise
     has_remainder = beside > 0.5 or remains
     generic = None
     if has_remainder:

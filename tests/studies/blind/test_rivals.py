@@ -30,7 +30,8 @@ def test_where_nothing_is_hidden_the_base_makes_the_forces() -> None:
         fitted = np.linalg.lstsq(regression.base, regression.force, rcond=None)[0]
         left.append(regression.force - regression.base @ fitted)
     gap = bench.gap(left)
-    assert gap["held_out_after"] == pytest.approx(gap["held_out_before"], rel=0.01)
+    # plain least squares also fits some of the noise in its slopes
+    assert gap["held_out_after"] == pytest.approx(gap["held_out_before"], rel=0.02)
     assert gap["held_out_after"] == pytest.approx(1.0, abs=0.1)
 
 
