@@ -143,7 +143,8 @@ class ToyReading(Toy):
         x = true + noise * np.sum(draws, axis=0)
         super().__init__(lambda a, b: a * x + b - y)
 
-    def with_noise_copy(self, copy: int) -> "ToyReading":
+    @property
+    def noise_copy(self) -> "ToyReading":
         return ToyReading(self.true, self.y, self.noise, self.copies + 1)
 
 

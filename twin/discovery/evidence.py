@@ -38,7 +38,6 @@ STRANGER_SHARES = (0.003, 0.01, 0.03, 0.1)  # the same for the stranger, each as
 SET_PRIORS = (0.5, 0.3, 0.15, 0.05)
 STRANGER_PRIOR = 0.2
 PAIR_STARTS, TRIPLE_STARTS, STRANGER_STARTS = 40, 12, 12  # sets that are extended
-NOISE_COPIES = 1  # of the noise, whose mean products are taken off
 MIN_BASE_SHARE = 1e-12  # of the curvature of the base: directions with less are left out
 MIN_INFORMATION_SHARE = 1e-9  # of a column's norm: with less left, other parameters imitate it
 
@@ -255,19 +254,16 @@ def build_evidence(
             requests.append((candidate.add_to(parameters, shape), amplitude, probe))
 
     columns, places = _fill_columns(log_residuals, parameters, requests, len(variants), mapper)
-    noise = np.zeros((len(columns), len(columns)))
-    for copy in range(NOISE_COPIES):
-        copies = [residuals.with_noise_copy(copy) for residuals in log_residuals]
-        noisy, _ = _fill_columns(copies, parameters, requests, len(variants), mapper)
-        noisy -= columns
-        noise += noisy @ noisy.T / NOISE_COPIES
+    copies = [residuals.noise_copy for residuals in log_residuals]
+    noisy, _ = _fill_columns(copies, parameters, requests, len(variants), mapper)
+    noisy -= columns
     unit = _number_units(log_residuals)
     rich_columns = [
         k for k, variant in enumerate(variants) if (variant.candidate.name, variant.shape) in rich
     ]
     return _absorb_base(
-        columns, noise, len(free), unit, tuple(variants), places, _measure_force(log_residuals),
-        rich_columns, expected_level(log_residuals),
+        columns, noisy @ noisy.T, len(free), unit, tuple(variants), places,
+        _measure_force(log_residuals), rich_columns, expected_level(log_residuals),
     )  # fmt: skip
 
 
@@ -368,8 +364,7 @@ def _absorb_base(
     )
     usable = np.where(is_left, own_scale, 0.0)
     own = rest[:-1] * np.where(is_left, own_scale, 0.0)[:, None]
-    chance = _absorb(noise, absorbed, base)[:-1, :-1] / NOISE_COPIES
-    chance *= np.outer(own_scale, own_scale)
+    chance = _absorb(noise, absorbed, base)[:-1, :-1] * np.outer(own_scale, own_scale)
     covariance = inflation * (own @ own.T + np.where(np.outer(is_left, is_left), chance, 0.0))
     covariance += np.diag(np.where(is_left, MIN_INFORMATION_SHARE * own_scale**2, 1.0))
     places = {

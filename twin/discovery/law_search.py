@@ -178,7 +178,7 @@ def _search_from(
 ) -> list[FittedSet]:
     """Return the sets of `start` and one or two terms that were fitted."""
     fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
-    for current in [*fitted_sets[:BEAM_WIDTH]]:
+    for current in fitted_sets[:BEAM_WIDTH]:
         excess = start.cost - problem.expected_square
         if _explains(problem, fitted_sets) or start.cost - current.cost < MIN_FIRST_GAIN * excess:
             break

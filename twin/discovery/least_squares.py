@@ -197,18 +197,12 @@ class _NoiseProducts:
     with_residual: Float1D
 
     def measure_gradient(self, x: Float1D) -> Float1D:
-        """Return half the slope of that share at x, (free,)."""
+        """Return half the slope at x of the residual squares that are noise, (free,)."""
         return self.with_residual + self.of_slopes @ (x - self.x)
 
     def take_off(self, information: Float2D, share: float = 1.0) -> Float2D:
         """Return information on the parameters, (free, free), without this share of the noise."""
-        if not self.of_slopes.any():
-            return information
         return information - _limit_noise(share * self.of_slopes, information)
-
-    @classmethod
-    def none(cls, x: Float1D) -> "_NoiseProducts":
-        return cls(x, np.zeros((x.size, x.size)), np.zeros(x.size))
 
 
 class _LevenbergMarquardt:
@@ -309,7 +303,7 @@ class _LevenbergMarquardt:
         self, x: Float1D, current: Sequence[Float1D], jacobian: Float2D
     ) -> _NoiseProducts:
         """Return the products of the noise of the readings, from a copy that has it once more."""
-        copies = [residuals.with_noise_copy(0) for residuals in self.log_residuals]
+        copies = [residuals.noise_copy for residuals in self.log_residuals]
         parameters = self.start.with_vector(x)
         noisy_values = [residuals.evaluate(parameters) for residuals in copies]
         slopes = np.empty_like(jacobian)
@@ -324,9 +318,8 @@ class _LevenbergMarquardt:
     ) -> FitResult:
         """Return the fit with standard errors from a sandwich estimator clustered by block."""
         parameters = self.start.with_vector(x)
-        noise = self.noise or _NoiseProducts.none(x)
         products = jacobian @ jacobian.T
-        hessian = noise.take_off(products)
+        hessian = self.noise.take_off(products) if self.noise else products
         scale = _curvature_scale(hessian)
         # parameters at a bound are fixed there
         inner = np.flatnonzero((self.low < x) & (x < self.high))
@@ -435,9 +428,11 @@ class _LevenbergMarquardt:
             x = np.where(dropped, vanishing, x)
             current = self.evaluate(x)
         r = np.concatenate(current)
-        noise, share = self.noise or _NoiseProducts.none(x), float(training.mean())
-        gradient = jacobian @ np.where(training, r, 0.0) - share * noise.measure_gradient(x)
-        hessian = noise.take_off(hessian, share)
+        gradient = jacobian @ np.where(training, r, 0.0)
+        if self.noise:
+            share = float(training.mean())
+            gradient -= share * self.noise.measure_gradient(x)
+            hessian = self.noise.take_off(hessian, share)
         cost = float(r[training] @ r[training])
         gradient[undetermined], hessian[undetermined], hessian[:, undetermined] = 0.0, 0.0, 0.0
         for damping in HELD_OUT_DAMPINGS:

@@ -608,12 +608,13 @@ class LogResiduals:
             [np.broadcast_to(n, size) for n, size in zip(self._row_noise, sizes, strict=True)]
         )
 
-    def with_noise_copy(self, copy: int) -> "LogResiduals":
-        """Return the residuals of the readings with noise once more; each `copy` has its own.
+    @cached_property
+    def noise_copy(self) -> "LogResiduals":
+        """Residuals of the readings with their noise once more, always the same.
 
         The terms of the nuisances have no noise: they stay as they are.
         """
-        noisy = self._louder_signals.add_noise(copy)
+        noisy = self._louder_signals.add_noise()
         fixed = self.with_signals(replace(self.signals, spectra=noisy.spectra))
         return replace(fixed, fixed_noise=self._row_noise, fixed_mask=self.row_mask)
 
@@ -628,8 +629,7 @@ class LogResiduals:
 
         What does not repeat between the cycles of a step is noise, also where neither the rest nor
         a quiet band shows it: half the mean square of the difference of successive cycles, less
-        what the motion itself did not repeat, the median over the steps. And instruments
-        err by a
+        what the motion itself did not repeat, the median over the steps. And instruments err by a
         share of the force in ways of which no nuisance is a form, the same in every cycle, as do
         the forms of the laws that the model has beside its `base`, of their own force: the weight
         counts these errors as noise of single steps.

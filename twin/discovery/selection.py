@@ -155,7 +155,7 @@ class SelectionProblem:
         """
         parameters = fitted.fit.parameters
         rows = [
-            (each.with_noise_copy(0).evaluate(parameters) - each.evaluate(parameters))[
+            (each.noise_copy.evaluate(parameters) - each.evaluate(parameters))[
                 each.entry_row < len(each.rows)
             ]
             for each in self.log_residuals
