@@ -139,6 +139,32 @@ def join_blocks(blocks: Sequence[Block]) -> Block:
     )
 
 
+def join_with_gaps(blocks: Sequence[Block]) -> Block:
+    """Join blocks of one stream, in order; missing samples between them are NaN, outside steps."""
+    parts: list[Block] = []
+    for block in blocks:
+        if parts and parts[-1].end < block.index:
+            parts.append(_make_missing_block(parts[-1], block.index))
+        parts.append(block)
+    return join_blocks(parts)
+
+
+def _make_missing_block(before: Block, until: int) -> Block:
+    count = until - before.end
+    outside = np.full(count, -1, dtype=np.int64)
+    values = np.full((len(before.channels), count), np.nan)
+    label = np.zeros(count, dtype=np.int64)
+    return Block(
+        before.stream, before.end, before.rate_hz, before.channels, values, outside, label, outside
+    )
+
+
+def find_stretches(is_in: npt.ArrayLike) -> list[tuple[int, int]]:
+    """Return (first, end) of each stretch of True, in order; is_in is (sample,)."""
+    edges = np.flatnonzero(np.diff(is_in, prepend=False, append=False))
+    return [(int(first), int(end)) for first, end in edges.reshape(-1, 2)]
+
+
 def finite_mean(samples: Float1D) -> float:
     """Return the mean of the samples that are not lost, (sample,); NaN if all are."""
     finite = samples[np.isfinite(samples)]
@@ -149,6 +175,15 @@ def finite_std(samples: Float1D) -> float:
     """Return the standard deviation of the samples that are not lost, (sample,); NaN if all are."""
     finite = samples[np.isfinite(samples)]
     return float(finite.std()) if finite.size else math.nan
+
+
+def interpolate_missing(samples: Float1D) -> Float1D:
+    """Interpolate lost samples linearly, (sample,); return zeros if all are lost."""
+    finite = np.isfinite(samples)
+    if finite.all() or not finite.any():
+        return np.nan_to_num(samples)
+    places = np.arange(samples.size)
+    return np.interp(places, places[finite], samples[finite])
 
 
 def join_contiguous(blocks: Iterable[Block]) -> tuple[Block, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
 from table_io.backends import Backend, MachineLost
-from table_io.block import Block, Bool2D
+from table_io.block import Block, Bool2D, find_stretches
 from table_io.clock import Clock, local_datetime
 from table_io.config.calibration import (
     compute_tare,
@@ -310,6 +310,5 @@ def find_gaps(block: Block, clipped: Bool2D) -> Iterator[SampleGap]:
         return
     for name, values, at_range in zip(block.channels, block.values, clipped, strict=True):
         for invalid, reason in ((np.isnan(values), "lost"), (at_range, "clipped")):
-            edges = np.flatnonzero(np.diff(invalid, prepend=False, append=False))
-            for first, last in edges.reshape(-1, 2).tolist():
+            for first, last in find_stretches(invalid):
                 yield SampleGap(block.index + first, last - first, name, reason)

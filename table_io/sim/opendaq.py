@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 
 from table_io.backends.machine.protocol import MachineMessage
 from table_io.backends.opendaq.source import load_library, require_opendaq_wiring
-from table_io.block import Float1D, Float2D
+from table_io.block import Float1D, Float2D, find_stretches
 from table_io.clock import wall_clock_ns
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
@@ -118,8 +118,7 @@ class OpenDaqServer:
     def send(self, index: int, volts: Float2D) -> None:
         """Send volts, (channel, sample), from `index` on, without samples lost in all channels."""
         present = ~np.isnan(volts).all(axis=0)
-        edges = np.flatnonzero(np.diff(present, prepend=False, append=False))
-        for first, last in edges.reshape(-1, 2).tolist():
+        for first, last in find_stretches(present):
             offset = self._start_ns + (index + first) * self._delta
             stamps = self._daq.DataPacket(self._stamps, last - first, offset)
             self._time.send_packet(stamps)

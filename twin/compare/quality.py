@@ -24,7 +24,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-from table_io.block import Block, Bool2D, Float1D
+from table_io.block import (
+    Block,
+    Float1D,
+    find_stretches,
+    interpolate_missing,
+    join_with_gaps,
+)
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from table_io.records import SampleGap
@@ -120,7 +126,8 @@ def clean_blocks(blocks: Sequence[Block], where: str) -> tuple[tuple[Block, ...]
     """
     if not blocks:
         return (), []
-    first, channels = blocks[0].index, join_channels(blocks)
+    joined = join_with_gaps(blocks)
+    first, channels = joined.index, dict(zip(joined.channels, joined.values, strict=True))
     gaps = find_bad_samples(channels, blocks[0].rate_hz)
     lines = describe_gaps(gaps, channels)
     cleaned = {name: np.array(values) for name, values in channels.items()}
@@ -137,15 +144,6 @@ def clean_blocks(blocks: Sequence[Block], where: str) -> tuple[tuple[Block, ...]
         replace(block, values=np.array([cleaned[name][window] for name in block.channels]))
         for block, window in zip(blocks, windows, strict=True)
     ), lines
-
-
-def join_channels(blocks: Sequence[Block]) -> dict[str, Float1D]:
-    """Return the channels of blocks from the first sample to the last, (sample,); NaN between."""
-    first, size = blocks[0].index, blocks[-1].end - blocks[0].index
-    joined = np.full((len(blocks[0].channels), size), np.nan)
-    for block in blocks:
-        joined[:, block.index - first : block.end - first] = block.values
-    return dict(zip(blocks[0].channels, joined, strict=True))
 
 
 def describe_gaps(gaps: Sequence[SampleGap], values: Mapping[str, Float1D]) -> list[str]:
@@ -212,7 +210,7 @@ def _find_suspects(values: Float1D) -> list[Span]:
         for first, end in spans:
             is_suspect[rows[first] : rows[end - 1] + 1] = True
         left[is_suspect] = np.nan
-    return _find_runs(is_suspect)
+    return find_stretches(is_suspect)
 
 
 def _find_limit(sizes: Float1D) -> float:
@@ -280,9 +278,9 @@ def _find_clipped(values: Float1D) -> list[Span]:
     levels = np.unique(x)
     spans: list[Span] = []
     for extreme, others in ((levels[-1], levels[-4:-1]), (levels[0], levels[1:4])):
-        runs = _find_runs(x == extreme)
+        runs = find_stretches(x == extreme)
         longest = max(end - first for first, end in runs)
-        usual = max(end - first for level in others for first, end in _find_runs(x == level))
+        usual = max(end - first for level in others for first, end in find_stretches(x == level))
         is_fine = levels.size > 0.25 * x.size
         least = MIN_CLIPPED_RUN if is_fine and usual == 1 else MIN_LEVEL_RATIO * usual
         if longest < max(least, MIN_CLIPPED_RUN) or extreme == 0.0:
@@ -302,12 +300,6 @@ def _find_clipped(values: Float1D) -> list[Span]:
     return sorted(spans)
 
 
-def _find_runs(is_in: Bool2D) -> list[Span]:
-    """Return the runs of True, (first, end)."""
-    edges = np.flatnonzero(np.diff(is_in, prepend=False, append=False))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def _find_stuck(channels: Mapping[str, Float1D], name: str) -> list[Span]:
     """Return the runs of equal samples in which the channel should have moved."""
     values = channels[name]
@@ -325,7 +317,7 @@ def _find_stuck(channels: Mapping[str, Float1D], name: str) -> list[Span]:
     least = MIN_STUCK_RUN if lasting == 1.0 else MIN_STUCK_RATIO * lasting
     is_cell = name in (*RIGHT_CELLS, *LEFT_CELLS)
     spans = []
-    for a, b in _find_runs(step == 0.0):
+    for a, b in find_stretches(step == 0.0):
         first, end = a, b + 1  # equal samples
         if end - first < least or (is_cell and x[first] in (0.0, x.min())):
             continue
@@ -511,8 +503,7 @@ def _max_delay(rate_hz: float) -> float:
 
 def _bridge(values: Float1D) -> Float1D:
     """Return values less their mean, (sample,), with straight lines in gaps."""
-    rows = np.flatnonzero(np.isfinite(values))
-    bridged = np.interp(np.arange(values.size), rows, values[rows])
+    bridged = interpolate_missing(values)
     return bridged - bridged.mean()
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D, Float1D, find_stretches, interpolate_missing
 
 FITS_PER_CYCLE = 4
 WINDOW_CYCLES = 2.0
@@ -57,25 +57,14 @@ def detect_rest(signal: Float1D, rate_hz: float) -> Bool2D:
     if floor > 0.1 * spread.max():
         return np.zeros(signal.size, dtype=bool)
     is_quiet = spread <= floor
-    edges = np.flatnonzero(np.diff(is_quiet, prepend=False, append=False)).reshape(-1, 2)
-    for first, last in edges:
+    for first, last in find_stretches(is_quiet):
         is_quiet[first:last] = (last - first) * PIECE_S >= MIN_QUIET_S
     return np.repeat(is_quiet, size)[: signal.size]
 
 
-def interpolate_missing(signal: Float1D) -> Float1D:
-    """Interpolate lost samples linearly, (sample,); return zeros if all are lost."""
-    finite = np.isfinite(signal)
-    if finite.all() or not finite.any():
-        return np.nan_to_num(signal)
-    places = np.arange(signal.size)
-    return np.interp(places, places[finite], signal[finite])
-
-
 def track_sines(signal: Float1D, moving: Bool2D, rate_hz: float) -> Iterator[SineTrack]:
     """Yield a track of every sine in the moving parts of a signal, (sample,), NaN if lost."""
-    edges = np.flatnonzero(np.diff(moving, prepend=False, append=False)).reshape(-1, 2)
-    for first, last in edges.tolist():
+    for first, last in find_stretches(moving):
         start = first
         while start < last:
             f = _acquire_frequency(signal[start:last], rate_hz)

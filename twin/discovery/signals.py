@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_blocks
+from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.discovery.hum import remove_hum
@@ -461,7 +461,11 @@ def build_signals(
     blocks: tuple[Block, ...], name: str, mass_kg: float, gaps_m: tuple[float, float]
 ) -> LogSignals:
     """Build the signals of measured blocks; raise InputError if no displacement was measured."""
-    block = _join_with_gaps(blocks, name)
+    if not blocks:
+        raise InputError(
+            "the log has no measured samples", where=name, remedy="give a recorded test"
+        )
+    block = join_with_gaps(blocks)
     columns = {
         key: block.channel(key)
         for key in USED_CHANNELS
@@ -545,30 +549,6 @@ def is_channel_alive(values: Float1D) -> bool:
     """Return False for a dead channel: no samples, or a constant value."""
     finite = values[np.isfinite(values)]
     return bool(finite.size and np.ptp(finite) > 0.0)
-
-
-def _join_with_gaps(blocks: tuple[Block, ...], name: str) -> Block:
-    """Join blocks into one; missing samples between them become NaN."""
-    if not blocks:
-        raise InputError(
-            "the log has no measured samples", where=name, remedy="give a recorded test"
-        )
-    parts: list[Block] = []
-    for block in blocks:
-        if parts and parts[-1].end < block.index:
-            parts.append(_missing_block(parts[-1], block.index))
-        parts.append(block)
-    return join_blocks(parts)
-
-
-def _missing_block(before: Block, until: int) -> Block:
-    count = until - before.end
-    outside = np.full(count, -1, dtype=np.int64)
-    values = np.full((len(before.channels), count), np.nan)
-    label = np.zeros(count, dtype=np.int64)
-    return Block(
-        before.stream, before.end, before.rate_hz, before.channels, values, outside, label, outside
-    )
 
 
 def _find_rest(block: Block) -> Bool2D:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D, Float1D, interpolate_missing
 
 TARGET_RATE_HZ = 500.0  # 50 samples of a contact of 0.1 s; noise above the band is removed
 ROLL_OFF_START = 0.8  # of the new Nyquist frequency: start of the low-pass roll-off
@@ -52,7 +52,7 @@ class FrequencyGrid:
 
     def to_spectrum(self, values: Float1D) -> Spectrum:
         """Return the spectrum, (frequency,), of values at the original rate, (sample,)."""
-        return rfft(bridge_gaps(values), self.padded_size)[: self.bin_count]
+        return rfft(interpolate_missing(values), self.padded_size)[: self.bin_count]
 
     def apply_gain(self, values: Float1D, gain: Float1D) -> Float1D:
         """Filter values at the decimated rate, (sample,), with a gain, (frequency,)."""
@@ -77,15 +77,6 @@ class FrequencyGrid:
     def white_noise_rms(self, gain: Float1D) -> float:
         """Return the rms of white noise of rms 1 (original rate) after a gain, (frequency,)."""
         return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))
-
-
-def bridge_gaps(values: Float1D) -> Float1D:
-    """Interpolate lost samples linearly, (sample,); callers exclude them from the fit."""
-    finite = np.isfinite(values)
-    if finite.all():
-        return values
-    places = np.arange(values.size)
-    return np.interp(places, places[finite], values[finite])
 
 
 def exclude_margins(good: Bool2D, margin: int) -> Bool2D:

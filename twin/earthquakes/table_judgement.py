@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from table_io.block import Float1D
+from table_io.block import Float1D, find_stretches
 from table_io.errors import InputError
 from twin.earthquakes.result import HYDRAULIC, ChannelEstimate, JudgedErrors, JudgedRun, Judgement
 from twin.earthquakes.table_effects import LIBRARY
@@ -131,16 +131,14 @@ def _check_saturation(log: str, channel: str, row: Float1D, other: Float1D, rate
 
     def list_parts(stays: npt.NDArray[np.bool_], least: float) -> list[int]:
         """Return the first samples of parts in which one stays and the other goes and returns."""
-        edges = np.diff(np.concatenate([[0], stays.astype(int), [0]]))
-        parts = zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True)
         limit = MOVING_SHARE * np.abs(other).max()
         moving = []
-        for start, end in parts:
+        for start, end in find_stretches(stays):
             part = other[start:end]
             ends = sorted((part[0], part[-1]))
             beyond = max(part.max() - ends[1], ends[0] - part.min())
             if end - start >= least and beyond > limit:
-                moving.append(int(start))
+                moving.append(start)
         return moving
 
     tolerance = CLIPPING_TOLERANCE * np.ptp(row)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Float2D, Label
+from table_io.block import Block, Float1D, Float2D, Label, find_stretches
 from table_io.config.base import load_config, parse_toml
 from table_io.config.channel import declare_table_channels, read_channels
 from table_io.config.folders import find_config, resolve_config
@@ -475,8 +475,8 @@ def _iter_lost_samples(grid: _SampleGrid) -> Iterator[Item]:
         is_lost = np.isnan(values) & ~is_hole
         for gap in bad:
             is_lost[gap.index : gap.end] = False
-        edges = np.flatnonzero(np.diff(is_lost, prepend=False, append=False)).reshape(-1, 2)
-        gaps = [*bad, *(SampleGap(a, b - a, name, "lost") for a, b in edges.tolist())]
+        lost = (SampleGap(a, b - a, name, "lost") for a, b in find_stretches(is_lost))
+        gaps = [*bad, *lost]
         if len(gaps) > MAX_GAPS:
             count = sum(gap.count for gap in gaps)
             yield Event(0, "warning", f"{name}: {count} of {grid.size} samples lost")

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from table_io.backends import open_backend
-from table_io.block import Float1D
+from table_io.block import Float1D, find_stretches
 from table_io.clock import ManualClock
 from table_io.config.excitation.continuation import Backbone
 from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
@@ -194,11 +194,10 @@ def _split_unstable(branch: Branch) -> list[UnstableStretch]:
         bool(((orbit.multipliers.imag == 0) & (orbit.multipliers.real > 1)).any())
         for orbit in orbits
     ]
-    edges = np.flatnonzero(np.diff(is_unstable, prepend=False, append=False)).reshape(-1, 2)
     frequencies = np.array([orbit.frequency_hz for orbit in orbits])
     amplitudes = np.array([orbit.u_max - orbit.u_min for orbit in orbits])
     stretches = []
-    for first, end in edges.tolist():
+    for first, end in find_stretches(is_unstable):
         if end - first < MIN_UNSTABLE_POINTS:
             continue
         scales = [float(np.ptp(values[first:end])) or 1.0 for values in (frequencies, amplitudes)]

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Float1D
+from table_io.block import Float1D, find_stretches
 from twin.dynamics.main_branches import locate_peak
 
 Bool1D = npt.NDArray[np.bool_]
@@ -95,12 +95,10 @@ def join_directions(
     The forward branch to the end of the widest range in which they differ, then the backward one
     from its beginning.
     """
-    edges = np.diff(np.concatenate([[0], differs.astype(int), [0]]))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    if not starts.size:
+    ranges = find_stretches(differs)
+    if not ranges:
         return frequency_hz, forward_m
-    widest = int((ends - starts).argmax())
-    first, last = int(starts[widest]), int(ends[widest])
+    first, last = max(ranges, key=lambda ends: ends[1] - ends[0])
     return (
         np.concatenate([frequency_hz[:last], frequency_hz[first:]]),
         np.concatenate([forward_m[:last], backward_m[first:]]),
