@@ -4,31 +4,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.studies.evidence.laboratory import Instruments, Specimen, StepTest, record, write_table
+from tests.studies.evidence.imported import format_profile, import_columns
+from tests.studies.evidence.laboratory import Instruments, Specimen, StepTest, record
 from twin.discovery.discover import prepare_problem
 from twin.discovery.loading import load_logs
 from twin.discovery.nuisances import list_sizes, widen_intervals
-from twin.exchange.import_table import ImportOptions, import_table
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
 START = Model(Parameters(550.0, 36e3, 1100.0, 500e3, 900.0, 500e3, 900.0, 4e-3, 4e-3))
-SPECIMEN = Specimen(gap_mm=-1.0)
-PROFILE = """
-title = "laboratory"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = {start}
-stop_hz = {stop}
-step_hz = {step}
-cycles = {cycles}
-measured_cycles = 4
-acceleration_g = 0.05
-[acquisition]
-rate_hz = 1000.0
-"""
 # Always in contact the damping of the bumpers and the lags of the readings look alike; in free
 # flight the mass still moves where the drive, and the record, has ended.
 CASES = {
@@ -42,17 +26,7 @@ def test_a_missing_accelerometer_biases_no_parameter(missing: str, tmp_path: Pat
     gap_mm, test = CASES[missing]
     specimen = Specimen(gap_mm=gap_mm)
     columns = record(specimen, Instruments(missing=(missing,)), 5, test)
-    profile = tmp_path / "lab.toml"
-    profile.write_text(
-        PROFILE.format(
-            gap=gap_mm, start=test.start_hz, stop=test.stop_hz, step=test.step_hz,
-            cycles=test.cycles,
-        )
-    )  # fmt: skip
-    log = tmp_path / "log.mcap"
-    import_table(
-        write_table(columns, tmp_path / "log.csv"), log, ImportOptions(profile=profile, accept=True)
-    )
+    log = import_columns(columns, tmp_path, format_profile(specimen, test))
     logs, _ = load_logs([log])
     prepared = prepare_problem(logs, START)
     problem = prepared.problem

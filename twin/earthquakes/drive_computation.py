@@ -16,8 +16,7 @@ from scipy.fft import next_fast_len
 
 from table_io.block import Float1D
 from table_io.config.excitation.waveform import smoothstep
-from twin.earthquakes.table_model import TableModel
-from twin.earthquakes.table_response import CROSSOVER_HZ, ResponseModel
+from twin.earthquakes.table_response import CROSSOVER_HZ, PredictiveModel
 
 BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
 MAX_AMPLIFICATION = 5.0  # of the inverse
@@ -36,7 +35,7 @@ class TwinDrive:
 
 
 def compute_command(
-    model: TableModel | ResponseModel,
+    model: PredictiveModel,
     target_m: Float1D,
     rate_hz: float,
     band_hz: tuple[float, float],
@@ -66,7 +65,7 @@ def compute_command(
 
 def compute_correction(
     lacking_m: Float1D,
-    model: TableModel | ResponseModel,
+    model: PredictiveModel,
     rate_hz: float,
     band_hz: tuple[float, float],
 ) -> Float1D:
@@ -99,7 +98,7 @@ class PlayedDrive:
 
 def correct_played_drive(
     run: PlayedDrive,
-    model: TableModel | ResponseModel,
+    model: PredictiveModel,
     target_m: Float1D,
     reaction_n: Float1D,
     rate_hz: float,
@@ -138,7 +137,7 @@ def measure_error(
 
 
 def _invert_response(
-    model: TableModel | ResponseModel, frequency_hz: Float1D, highest_hz: float
+    model: PredictiveModel, frequency_hz: Float1D, highest_hz: float
 ) -> npt.NDArray[np.complex128]:
     """Return the inverse of the linear response, tapered above the band and bounded."""
     response = model.frequency_response(frequency_hz)

@@ -14,8 +14,7 @@ from scipy import signal
 from table_io.block import Float1D
 from twin.drawing.plot_style import GUIDE_COLOUR, RC_PARAMS, measured_style, twin_style
 from twin.earthquakes.table_identification import HIGHEST_HZ, LOWEST_HZ, TableRehearsal
-from twin.earthquakes.table_model import TableModel
-from twin.earthquakes.table_response import ResponseModel
+from twin.earthquakes.table_response import PredictiveModel
 
 SEGMENT_S = 5.0  # of the estimate of the frequency response
 EXCITED_SHARE = 0.01  # of the largest power of the command: less says nothing of the table
@@ -25,7 +24,7 @@ REST_S = 0.01  # before a step, besides the delay
 
 
 def draw_table_twin(
-    model: TableModel | ResponseModel, rehearsal: TableRehearsal, title: str, out: Path
+    model: PredictiveModel, rehearsal: TableRehearsal, title: str, out: Path
 ) -> None:
     """Draw gain, phase and coherence of a rehearsal and its twin, and steps of the twin."""
     played = model.simulate(rehearsal.command_m, rehearsal.rate_hz, rehearsal.reaction_n)
@@ -80,11 +79,10 @@ def estimate_response(
     return hz[inside], cross[inside] / power[inside], shared[inside]
 
 
-def plot_steps(axis: Axes, model: TableModel | ResponseModel) -> None:
+def plot_steps(axis: Axes, model: PredictiveModel) -> None:
     """Plot responses of the twin to steps of several sizes, each over its size."""
     time_s = np.arange(round(STEP_S * STEP_RATE_HZ)) / STEP_RATE_HZ
-    delay_s = model.parameters.delay_s if isinstance(model, TableModel) else model.delay_s
-    rest = math.ceil((max(delay_s, 0.0) + REST_S) * STEP_RATE_HZ)
+    rest = math.ceil((max(model.delay_s, 0.0) + REST_S) * STEP_RATE_HZ)
     for step_mm, shade in zip(STEPS_MM, (0.35, 0.65, 1.0), strict=True):
         command = np.concatenate([np.zeros(rest), np.full(time_s.size, 1e-3 * step_mm)])
         reached = model.simulate(command, STEP_RATE_HZ)[0][rest:] / command[-1]

@@ -17,7 +17,12 @@ from table_io.errors import InputError, suggest
 from twin.earthquakes.table_effects import EFFECT_BY_ID, EffectDiscovery
 from twin.earthquakes.table_identification import TableIdentification, TableRehearsal
 from twin.earthquakes.table_model import TableModel, TableParameters
-from twin.earthquakes.table_response import STRUCTURE_BY_ID, Resonance, ResponseModel
+from twin.earthquakes.table_response import (
+    STRUCTURE_BY_ID,
+    PredictiveModel,
+    Resonance,
+    ResponseModel,
+)
 from twin.setup.run_config import RunConfig, read_run_config
 
 DRIVE_FILE, PROFILE_FILE = "drive.csv", "profile.toml"
@@ -155,7 +160,7 @@ class TableTwinConfig(ConfigModel):
             )
         return response
 
-    def build_model(self) -> TableModel | ResponseModel:
+    def build_model(self) -> PredictiveModel:
         """Return the twin of the table."""
         response = self.response
         if response is None:
@@ -188,7 +193,7 @@ class TableTwinResult:
 
     title: str
     mass_kg: float
-    model: TableModel | ResponseModel
+    model: PredictiveModel
     residual: float
     judgement: Judgement
     identification: TableIdentification | None

@@ -7,7 +7,7 @@ are fitted with parts of the time left out, and the simplest that is not worse i
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,8 +31,8 @@ from twin.earthquakes.table_response import (
     FRICTION_TERMS,
     STRUCTURES,
     BandProjection,
+    PredictiveModel,
     ResponseData,
-    ResponseModel,
     ResponseRegression,
     ResponseStructure,
     find_delay,
@@ -288,7 +288,7 @@ class StructureTrial:
     """
 
     id: str
-    model: TableModel | ResponseModel
+    model: PredictiveModel
     held_out: tuple[Float1D, ...]
     error: float
 
@@ -397,10 +397,9 @@ def judge_fitted_logs(
 ) -> Judgement:
     """Return the judgement of a twin by the parts of its own logs that were left out in turn."""
     frf = next(trial for trial in trials if trial.id == "frf")
-    runs = []
-    for log, own, left, left_by_frf in zip(logs, data, chosen.held_out, frf.held_out, strict=True):
-        runs.append(_judge_run(log, own, left, left_by_frf))
-    return _build_judgement(chosen, trials, runs, "parts of the fitted logs, left out in turn")
+    left = zip(chosen.held_out, frf.held_out, strict=True)
+    on = "parts of the fitted logs, left out in turn"
+    return _build_judgement(chosen, trials, logs, data, left, on)
 
 
 def judge_other_logs(
@@ -411,13 +410,14 @@ def judge_other_logs(
 ) -> Judgement:
     """Return the judgement of a twin by logs that were not fitted."""
     frf = next(trial for trial in trials if trial.id == "frf")
-    runs = []
-    for log, own in zip(logs, data, strict=True):
-        left, left_by_frf = (
-            own.measured - _predict(trial.model, log.motion, own) for trial in (chosen, frf)
+    left = (
+        (
+            own.measured - _predict(chosen.model, log.motion, own),
+            own.measured - _predict(frf.model, log.motion, own),
         )
-        runs.append(_judge_run(log, own, left, left_by_frf))
-    return _build_judgement(chosen, trials, runs, "other logs")
+        for log, own in zip(logs, data, strict=True)
+    )
+    return _build_judgement(chosen, trials, logs, data, left, "other logs")
 
 
 def estimate_with_channels(
@@ -443,9 +443,7 @@ def estimate_with_channels(
     return ChannelEstimate(channels=channels, errors=tuple(errors))
 
 
-def _predict(
-    model: TableModel | ResponseModel, motion: TableRehearsal, data: ResponseData
-) -> Float1D:
+def _predict(model: PredictiveModel, motion: TableRehearsal, data: ResponseData) -> Float1D:
     """Return the acceleration that a twin predicts in the band in m/s2, (row,)."""
     out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
     if not np.isfinite(out).all():
@@ -480,9 +478,13 @@ def _judge_run(
 def _build_judgement(
     chosen: StructureTrial,
     trials: Sequence[StructureTrial],
-    runs: Sequence[JudgedRun],
+    logs: Sequence[NamedMotion],
+    data: Sequence[ResponseData],
+    left: Iterable[tuple[Float1D, Float1D]],
     on: str,
 ) -> Judgement:
+    """Return a judgement by what the twin and the frequency response leave of each log."""
+    runs = [_judge_run(log, own, *both) for log, own, both in zip(logs, data, left, strict=True)]
     return Judgement(
         structure=chosen.id,
         on=on,

@@ -237,6 +237,11 @@ class TableModel:
     mass_kg: float
     parameters: TableParameters = field(default_factory=TableParameters)
 
+    @property
+    def delay_s(self) -> float:
+        """Delay of the command in s."""
+        return self.parameters.delay_s
+
     def simulate(
         self, command_m: Float1D, rate_hz: float, reaction_n: Float1D | None = None
     ) -> Float2D:

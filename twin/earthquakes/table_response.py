@@ -23,6 +23,7 @@ from scipy.fft import next_fast_len
 
 from table_io.block import Float1D, Float2D, Int1D
 from table_io.config.excitation.waveform import smoothstep
+from twin.earthquakes.table_model import TableModel
 
 Complex1D = npt.NDArray[np.complex128]
 Complex2D = npt.NDArray[np.complex128]
@@ -148,6 +149,9 @@ class ResponseModel:
         response = np.zeros(frequency_hz.size, complex)
         response[inside] = np.asarray(self.coefficients[name]) @ columns
         return response
+
+
+PredictiveModel = TableModel | ResponseModel  # of a table, from its command
 
 
 def _list_columns(

@@ -47,8 +47,11 @@ from twin.earthquakes.table_judgement import (
     prepare_data,
     try_hydraulic_fit,
 )
-from twin.earthquakes.table_model import TableModel
-from twin.earthquakes.table_response import CROSSOVER_HZ, BandProjection, ResponseModel
+from twin.earthquakes.table_response import (
+    CROSSOVER_HZ,
+    BandProjection,
+    PredictiveModel,
+)
 from twin.recording.reader import Recording
 from twin.results.recordings import build_provenance, open_recording
 from twin.results.tracking import find_band
@@ -122,7 +125,7 @@ def identify_table(
         # Before the frequency response: of equal errors, physical parameters are worth more.
         trials.insert(2, try_hydraulic_fit(hydraulic, logs, data))
     chosen = choose_structure(trials)
-    is_hydraulic = hydraulic is not None and chosen.id == HYDRAULIC
+    fitted_table = hydraulic if chosen.id == HYDRAULIC else None
     judged_data = prepare_data(judges, band_hz)
     judgement = (
         judge_other_logs(chosen, trials, judges, judged_data)
@@ -135,10 +138,10 @@ def identify_table(
         f"{rig.title}, from {recordings[0].run}{others}",
         rig.moving_mass_kg,
         chosen.model,
-        math.sqrt(hydraulic.cost) if hydraulic is not None and is_hydraulic else chosen.error,
+        chosen.error if fitted_table is None else math.sqrt(fitted_table.cost),
         judgement.model_copy(update={"estimate": estimate}),
-        hydraulic.to_identification() if hydraulic is not None and is_hydraulic else None,
-        discovery if is_hydraulic else None,
+        None if fitted_table is None else fitted_table.to_identification(),
+        None if fitted_table is None else discovery,
         logs[0].motion,
         build_provenance({recording.path: recording.start for recording in recordings}),
     )
@@ -190,7 +193,7 @@ class DriveComputation:
     rig: str
     target_m: Float1D
     reaction_n: Float1D
-    model: TableModel | ResponseModel
+    model: PredictiveModel
     twin: TableTwinConfig
     twin_path: Path
     band_hz: tuple[float, float]

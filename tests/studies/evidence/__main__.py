@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.studies.evidence.imported import format_profile, import_columns
 from tests.studies.evidence.laboratory import (
     Instruments,
     Specimen,
@@ -21,25 +22,7 @@ from tests.studies.evidence.laboratory import (
     record,
     record_component,
     vary,
-    write_table,
 )
-
-PROFILE = """title = "laboratory"
-rig = "simulated"
-model = "snm"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = {start}
-stop_hz = {stop}
-step_hz = {step}
-cycles = {cycles}
-measured_cycles = 4
-acceleration_g = 0.05
-[acquisition]
-rate_hz = {rate}
-"""
 
 
 @dataclass(frozen=True)
@@ -175,34 +158,25 @@ GROUPS = {
 def play(case: Case) -> dict[str, object]:
     """Return what the product says of a case, next to the truth."""
     from twin.discovery.task import discover
-    from twin.exchange.import_table import ImportOptions, import_table
 
     s = case.specimen
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
+        profile = ""
         if case.component is not None:
             columns = record_component(s, case.lab, case.seed, *case.component)
-            options = ImportOptions(accept=True)
         else:
             columns = record(s, case.lab, case.seed, case.test)
-            t = case.test
-            (folder / "lab.toml").write_text(
-                PROFILE.format(
-                    gap=s.gap_mm, start=t.start_hz, stop=t.stop_hz, step=t.step_hz,
-                    cycles=t.cycles, rate=t.rate_hz,
-                )
-            )  # fmt: skip
-            options = ImportOptions(profile=folder / "lab.toml", accept=True)
-        table = write_table(columns, folder / "log.csv")
+            profile = format_profile(s, case.test)
         start = time.process_time()
         row: dict[str, object] = {
             "group": case.group, "name": case.name, "seed": case.seed, "truth": case.truth,
             "place": case.place,
         }  # fmt: skip
         try:
-            import_table(table, folder / "log.mcap", options)
+            log = import_columns(columns, folder, profile)
             start = time.process_time()
-            result = discover([folder / "log.mcap"])
+            result = discover([log])
         except Exception as error:
             return {**row, "verdict": f"error {type(error).__name__}: {str(error)[:150]}"}
         verdict = result.verdict
