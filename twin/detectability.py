@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from table_io.acquisition.session import run_session
+from table_io.acquisition.session import find_take_back, run_session
 from table_io.backends import open_backend
 from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
@@ -132,7 +132,10 @@ def play_test(profile_toml: str, rig_toml: str, model_toml: str, log: Path) -> N
     clock = ManualClock()
     backend = open_backend(config.rig, config.profile, clock)
     make_start = config.make_start_factory("case", "table")
-    start, *items = run_session(config.session_setup, backend, clock, make_start, lambda: None)
+    take_back = find_take_back(backend, clock)
+    start, *items = run_session(
+        config.session_setup, backend, clock, make_start, lambda: None, take_back=take_back
+    )
     stop = items[-1] if items else start
     if isinstance(stop, RunStop) and stop.verdict != "complete":
         raise InputError(f"the test does not reach its end: {stop.reason}")

@@ -102,6 +102,17 @@ class OutputQueue:
             raise self._start_underrun_decay() from None
 
     @property
+    def is_late(self) -> bool:
+        """True if the machine has played more samples than were read."""
+        return self.played_samples() > self.acquired
+
+    def samples_until_feed(self) -> float:
+        """Return after how many more samples `feed` queues again; inf if all is queued."""
+        if self._queued_end >= self.drive.rest_start:
+            return math.inf
+        return self._queued_end - self.played_samples() - self._lead_samples + 1
+
+    @property
     def has_run_out(self) -> bool:
         """True if the machine can no longer be kept from the decay behind the lead."""
         earliest = self.played_samples() + self.backend.replace_after

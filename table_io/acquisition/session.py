@@ -4,7 +4,9 @@ States: idle, checking, armed, running, holding, stopping, at rest, fault. Every
 decay of the command to rest. The queued command always ends at rest, even if this process dies.
 """
 
-from collections.abc import Callable, Generator, Iterator
+import contextlib
+import math
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +14,7 @@ import numpy as np
 from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
 from table_io.backends import Backend, MachineLost
 from table_io.block import Block, Bool2D, find_stretches
-from table_io.clock import Clock, local_datetime
+from table_io.clock import Clock, ManualClock, local_datetime
 from table_io.config.calibration import (
     compute_tare,
     find_overdue_calibrations,
@@ -23,6 +25,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import Event, FrequencyResponse, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.safety import protection
+from table_io.safety.findings import Finding
 from table_io.sequencer import procedure
 from table_io.sequencer.state import SequencerState
 
@@ -62,6 +65,7 @@ class EventLog:
 
 TARE_S = 1.0
 MAX_FEEDBACK_TRIES = 5
+MAX_QUIET_S = 2.0  # of blocks that are acquired at once
 COMMAND_DELAY_S = 0.1  # extra margin for hold and resume, which are not urgent
 CLIP_RATIO = 0.999  # of a sensor's range; a sample at or above it is clipped
 
@@ -92,7 +96,27 @@ class LatenessLog:
 RunDescriber = Callable[[dict[str, float], float], RunStart]  # (tare, epoch_s) -> start record
 CommandSource = Callable[[], OperatorCommand | None]  # must not block
 SessionOutput = Generator[Block | Record, None, None]
+TakeBack = Callable[[], Callable[[], None]]  # keeps a state; what it returns restores it
+Acquired = tuple[Block, Bool2D, tuple[Finding, ...]]  # with the mask of clipped samples
 COMMAND_NAMES = ("hold", "resume", "stop", "abort")
+
+
+def find_take_back(backend: Backend, clock: ManualClock) -> TakeBack | None:
+    """Return what keeps the state of a simulated machine and its clock; None for another one."""
+    keep: TakeBack | None = getattr(backend, "take_back", None)
+    if keep is None:
+        return None
+
+    def take_back() -> Callable[[], None]:
+        restore, time_s = keep(), clock.time_s
+
+        def restore_all() -> None:
+            restore()
+            clock.time_s = time_s
+
+        return restore_all
+
+    return take_back
 
 
 def run_session(
@@ -102,10 +126,13 @@ def run_session(
     describe: RunDescriber,
     commands: CommandSource,
     punctuality: LatenessLog | None = None,
+    take_back: TakeBack | None = None,
 ) -> SessionOutput:
     """Yield RunStart, then every Block followed by its records, then RunStop.
 
-    Closing the generator early also brings the table to rest before the machine is released.
+    Closing the generator early also brings the table to rest before the machine is released. With
+    `take_back`, of a simulation that can go back in time, blocks in which nothing happens are
+    joined up to the next decision; every record stays the same.
     """
     run = _Session(setup, backend, clock)
     try:
@@ -113,14 +140,15 @@ def run_session(
         yield describe(tare, backend.scheduled_time_s(0))
         yield from run.event_log.drain()
         while not run.is_finished:
-            block, clipped = run.acquire(tare)
+            acquired = run.acquire_quiet_blocks(tare, take_back) if take_back else None
+            block, clipped, findings = acquired or run.acquire(tare)
             late_s = clock.now() - backend.scheduled_time_s(block.end - 1)
             if punctuality is not None:
                 punctuality.late_s.append(late_s)
             yield block
             yield from find_gaps(block, clipped)
             run.event_log.report_lateness(late_s, block.end)
-            run.protect(block, clipped)
+            run.protect(block, findings)
             run.advance_test(block)
             run.execute(commands())
             run.feed()
@@ -150,6 +178,7 @@ class _Session:
         self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
         self._full_scale_v = np.array([abs(s.range_si * s.volts_per_si) for s in setup.rig.sensors])
         self.event_log = EventLog(lambda: self.output_queue.acquired)
+        self._answered_end = 0  # up to here blocks are answered one by one
 
     @property
     def end(self) -> int | None:
@@ -181,10 +210,10 @@ class _Session:
         self.output_queue.start()
         return compute_tare(volts, sensors) | self.setup.rig.stated_offsets
 
-    def acquire(self, tare: dict[str, float]) -> tuple[Block, Bool2D]:
-        """Read (next block in SI, mask of clipped samples (channel, sample))."""
+    def acquire(self, tare: dict[str, float], blocks: int = 1) -> Acquired:
+        """Read and inspect the next blocks in SI: (block, clipped (channel, sample), findings)."""
         rig, first = self.setup.rig, self.output_queue.acquired
-        count = self.setup.profile.acquisition.block_samples
+        count = blocks * self.setup.profile.acquisition.block_samples
         if self.end is not None:
             count = min(count, self.end - first)
         volts = self.output_queue.backend.read(count)
@@ -192,12 +221,48 @@ class _Session:
         values = volts_to_si(volts, rig.sensors, tare)
         self.output_queue.acquired += count
         block = Block("meas", first, self.rate_hz, rig.channels, values, *labels)
-        return block, np.abs(volts) >= CLIP_RATIO * self._full_scale_v[:, None]
-
-    def protect(self, block: Block, clipped: Bool2D) -> None:
-        """Apply protection to a block; the first finding that must stop the table is latched."""
+        clipped = np.abs(volts) >= CLIP_RATIO * self._full_scale_v[:, None]
         observation = protection.Observation.from_drive(block, clipped, self.output_queue.drive)
         self._protection, findings = protection.inspect_samples(self._protection, observation)
+        return block, clipped, findings
+
+    def acquire_quiet_blocks(self, tare: dict[str, float], take_back: TakeBack) -> Acquired | None:
+        """Acquire all blocks up to the next decision at once; None if one of them needs an answer.
+
+        Then the machine and the protection are as before, and the blocks follow one by one.
+        """
+        first, state = self.output_queue.acquired, self._protection
+        blocks = self._count_quiet_blocks() if first >= self._answered_end else 1
+        if blocks == 1:
+            return None
+        restore = take_back()
+        with contextlib.suppress(MachineLost):
+            block, clipped, findings = acquired = self.acquire(tare, blocks)
+            is_armed = self.event_log.states[-1] == "armed"
+            if not (
+                findings
+                or self.output_queue.is_late
+                or clipped.any()
+                or np.isnan(block.values).any()
+                or (is_armed and (block.step >= 0).any())
+            ):
+                return acquired
+        restore()
+        self.output_queue.acquired, self._protection = first, state
+        self._answered_end = first + blocks * self.setup.profile.acquisition.block_samples
+        return None
+
+    def _count_quiet_blocks(self) -> int:
+        """Return after how many blocks, at least 1, the queue is fed or the sequencer decides."""
+        samples = min(self.output_queue.samples_until_feed(), self.rate_hz * MAX_QUIET_S)
+        if self._state.search is not None or self.output_queue.is_late:
+            return 1  # a feedback answers every block
+        if self._state.stage.kind in procedure.DECISION_FUNCTIONS:
+            samples = min(samples, self._state.stage.last - self.output_queue.acquired)
+        return max(math.ceil(samples / self.setup.profile.acquisition.block_samples), 1)
+
+    def protect(self, block: Block, findings: Iterable[Finding]) -> None:
+        """Report the findings of a block; the first one that must stop the table is latched."""
         for finding in findings:
             if not finding.stop:
                 self.event_log.pending.append(finding.to_event())

@@ -29,6 +29,10 @@ class ConfigModel(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
+    def __deepcopy__(self, memo: dict[int, Any] | None = None) -> Self:
+        """Return the config itself: it never changes, and what holds it may be copied often."""
+        return self
+
     @classmethod
     def list_keys(cls) -> list[str]:
         """List the allowed keys."""

@@ -7,6 +7,7 @@ A ground truth changes the plant and distorts the readings of sensors, with the 
 of `ground_truth.DEFINITION_BY_ID`, in SI.
 """
 
+import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -331,6 +332,17 @@ class SimulatedBackend:
             values = self._distortion.apply(values)
         volts = self._digitizer.digitize(values, self._noise, self._laboratory)
         return self._faults.apply_to_inputs(first, volts)
+
+    def take_back(self) -> Callable[[], None]:
+        """Return what takes the table back to its present sample, with the command then queued."""
+        parts = (self._distortion, self._faults, self._state, self._laboratory, self._noise)
+        kept, first = copy.deepcopy(parts), self._next
+
+        def restore() -> None:
+            self._distortion, self._faults, self._state, self._laboratory, self._noise = kept
+            self._next = first
+
+        return restore
 
     def scheduled_time_s(self, index: int) -> float:
         """Return the time on the session's clock at which sample `index` is taken, in s."""

@@ -8,7 +8,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from table_io.acquisition.session import OperatorCommand, SessionSetup, run_session
+from table_io.acquisition.session import (
+    OperatorCommand,
+    SessionSetup,
+    find_take_back,
+    run_session,
+)
 from table_io.backends import Backend, open_backend
 from table_io.block import Block, Float1D, join_blocks
 from table_io.clock import ManualClock
@@ -99,8 +104,12 @@ def play_session(
     operate: Callable[[], OperatorCommand | None] = lambda: None,
     clock: ManualClock | None = None,
     backend: Backend | None = None,
+    joins_blocks: bool = False,
 ) -> PlayedSession:
-    """Play a whole session, unpaced; it is stopped by the operator after `stop_s` of samples."""
+    """Play a whole session, unpaced; it is stopped by the operator after `stop_s` of samples.
+
+    `joins_blocks`: as in an unpaced run, where the blocks up to the next decision are one.
+    """
     clock = clock or ManualClock()
     backend = backend or open_backend(rig, profile, clock)
     items: list[Block | Record] = []
@@ -112,7 +121,9 @@ def play_session(
     def order() -> OperatorCommand | None:
         return OperatorCommand("stop", "time") if end > stop_s * backend.rate_hz else operate()
 
-    for item in run_session(SessionSetup(profile, rig), backend, clock, describe, order):
+    take_back = find_take_back(backend, clock) if joins_blocks else None
+    setup = SessionSetup(profile, rig)
+    for item in run_session(setup, backend, clock, describe, order, take_back=take_back):
         end = item.end if isinstance(item, Block) else end
         items.append(item)
     return PlayedSession(items)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from table_io.acquisition.session import OperatorCommand, run_session
+from table_io.acquisition.session import OperatorCommand, find_take_back, run_session
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
@@ -112,7 +112,12 @@ def play_unpaced(
         return OperatorCommand("stop", why) if (why := poll_interrupt()) else None
 
     source = run_session(
-        config.session_setup, backend, clock, config.make_start_factory(run, "table"), poll_command
+        config.session_setup,
+        backend,
+        clock,
+        config.make_start_factory(run, "table"),
+        poll_command,
+        take_back=find_take_back(backend, clock),
     )
     record_items(
         add_twin_items(source, config.prepare_twin()), path, run, config.drive.rate_hz, on_item

@@ -19,8 +19,9 @@ from table_io.records import Event, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.sim.simulated_table import SimulatedBackend
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
-from tests.builders.rigs import RIG, command_to_si, si_to_volts
-from tests.builders.sessions import make_start
+from tests.builders.profiles import make_profile
+from tests.builders.rigs import RIG, command_to_si, make_faulty_rig, si_to_volts
+from tests.builders.sessions import make_start, play_session
 
 RATE_HZ = 2000.0
 A = 0.05 * GRAVITY_M_S2
@@ -232,6 +233,31 @@ def test_complete_run_hands_out_every_sample_once_and_in_order(block_samples: in
     assert stop_record(items) == RunStop(
         whole.end, "complete", "the whole drive was played", states
     )
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {},
+        {"kind": "dropped", "at_s": 4.013, "for_s": 0.02},
+        {"kind": "spike", "at_s": 4.013, "channel": "table_acc_m_s2", "size": 3.0},
+        {"kind": "cable_off", "at_s": 4.013, "channel": "table_disp_m"},
+        {"kind": "late", "at_s": 4.013, "size": 0.15},
+        {"kind": "stall", "at_s": 4.013},
+    ],
+    ids=lambda fault: fault.get("kind", "none"),
+)
+def test_joined_blocks_change_no_sample_and_no_record(fault: dict[str, Any]) -> None:
+    tested = make_profile(start_hz=3.0, stop_hz=3.0, cycles=6)
+    rig = make_faulty_rig([fault] if fault else [])
+    each, joined = (play_session(tested, rig=rig, joins_blocks=joins) for joins in (False, True))
+    assert each.block.is_identical(joined.block)
+    records = [
+        [item for item in played.items if not isinstance(item, (Block, RunStart))]
+        for played in (each, joined)
+    ]
+    assert records[0] == records[1]
+    assert len(joined.select(Block)) < len(each.select(Block)) / 2
 
 
 def test_machine_is_used_in_the_order_of_its_contract() -> None:
