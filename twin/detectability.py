@@ -16,9 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from table_io.acquisition.session import find_take_back, run_session
-from table_io.backends import open_backend
-from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.profile import Specimen
 from table_io.config.toml_text import format_toml
@@ -34,6 +31,7 @@ from twin.model.config import ModelConfig
 from twin.model.model import EffectInstance, Model
 from twin.recording.mcap_log import write_items
 from twin.setup.run_config import from_texts
+from twin.setup.unpaced import iter_simulated_session
 from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CaseChunk, Outcome, OutcomeVariable
 
@@ -129,13 +127,7 @@ def make_rig_toml(noise_factor: float, seed: int, truth: Path) -> str:
 def play_test(profile_toml: str, rig_toml: str, model_toml: str, log: Path) -> None:
     """Record a test on the simulated table; InputError if it is not played to its end."""
     config = from_texts("case", profile_toml, rig_toml, model_toml, "the study")
-    clock = ManualClock()
-    backend = open_backend(config.rig, config.profile, clock)
-    make_start = config.make_start_factory("case", "table")
-    take_back = find_take_back(backend, clock)
-    start, *items = run_session(
-        config.session_setup, backend, clock, make_start, lambda: None, take_back=take_back
-    )
+    start, *items = iter_simulated_session(config, "case")
     stop = items[-1] if items else start
     if isinstance(stop, RunStop) and stop.verdict != "complete":
         raise InputError(f"the test does not reach its end: {stop.reason}")

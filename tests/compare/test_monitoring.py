@@ -14,10 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.acquisition.session import run_session
-from table_io.backends import open_backend
 from table_io.block import Block, Float1D, join_blocks
-from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.records import (
     Agreement,
@@ -47,6 +44,7 @@ from twin.dynamics.event_driven_map import make_period_map
 from twin.dynamics.orbits import settle_to_orbit
 from twin.model.ideal_response import simulate_sweep
 from twin.setup.run_config import RunConfig, from_texts
+from twin.setup.unpaced import iter_simulated_session
 from twin.transport.codec import encode_item
 
 # Slow enough for many cycles of contact, short enough for a test; no loop check, no tuning.
@@ -77,15 +75,7 @@ def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
     with TemporaryDirectory() as folder:
         rig = hide_truth(RIG_TEXT, Path(folder), truth)
         bundle = from_texts("x", PROFILE.format(gap=gap), rig, read_model_text("snm"), "x")
-        clock = ManualClock()
-        backend = open_backend(bundle.rig, bundle.profile, clock)
-        items = run_session(
-            bundle.session_setup,
-            backend,
-            clock,
-            bundle.make_start_factory("r", "table"),
-            lambda: None,
-        )
+        items = iter_simulated_session(bundle, "r")
         return bundle, join_blocks([item for item in items if isinstance(item, Block)])
 
 

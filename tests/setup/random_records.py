@@ -15,10 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from table_io.acquisition.session import run_session
-from table_io.backends import open_backend
 from table_io.block import Block, Float1D
-from table_io.clock import ManualClock
 from table_io.config.excitation import add_drive_margin
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.provenance import Provenance
@@ -27,6 +24,7 @@ from table_io.records import RunStop, Trip
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
 from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import iter_simulated_session
 
 ROUNDING_RATIO = 1.01  # of the converter and of differences
 TABLE_ALLOWANCE = 1.3  # by which a table may ring beyond the motion of its command
@@ -154,18 +152,9 @@ def play_case(seed: int) -> RecordOutcome:
 
 def play_record(seed: int, config: RunConfig) -> RecordOutcome:
     """Play a record that was not refused, and compare its measured motion with the limits."""
-    clock = ManualClock()
-    backend = open_backend(config.rig, config.profile, clock)
     verdict, tripped = "", False
     blocks: list[Block] = []
-    items = run_session(
-        config.session_setup,
-        backend,
-        clock,
-        config.make_start_factory("run", "table"),
-        lambda: None,
-    )
-    for item in items:
+    for item in iter_simulated_session(config, "run"):
         if isinstance(item, Block):
             blocks.append(item)
         elif isinstance(item, Trip):

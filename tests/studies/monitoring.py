@@ -15,10 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from table_io.acquisition.session import run_session
-from table_io.backends import open_backend
 from table_io.block import Block
-from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.config.toml_text import format_toml
 from table_io.records import Event, Record
@@ -26,7 +23,7 @@ from table_io.sim.imperfections import Level, draw_laboratory
 from tests.builders.truths import hide_truth
 from twin.compare.monitoring import EVENT_KINDS
 from twin.setup.run_config import RunConfig, from_texts
-from twin.setup.unpaced import add_twin_items
+from twin.setup.unpaced import add_twin_items, iter_simulated_session
 
 ALL = ("ginf", "g30", "g16", "g10", "g4_ss1", "g4_ss2", "g4_ss3", "g0", "gm1", "gm2", "gm10")
 LOST_SHARE = 0.05
@@ -38,11 +35,8 @@ def iter_session(name: str, truth: str, folder: Path) -> Iterator[tuple[RunConfi
     files = (f"tests/{name}.toml", "rigs/simulated.toml", "models/snm.toml")
     profile, rig, model = ((PROFILES_DIR / file).read_text() for file in files)
     rig = hide_truth(rig, folder, truth)
-    bundle, clock = from_texts(name, profile, rig, model, name), ManualClock()
-    backend = open_backend(bundle.rig, bundle.profile, clock)
-    start = bundle.make_start_factory("r", "table")
-    items = run_session(bundle.session_setup, backend, clock, start, lambda: None)
-    for item in add_twin_items(items, bundle.prepare_twin()):
+    bundle = from_texts(name, profile, rig, model, name)
+    for item in add_twin_items(iter_simulated_session(bundle, "r"), bundle.prepare_twin()):
         yield bundle, item
 
 

@@ -41,7 +41,7 @@ class TwinSetup:
     from_rest: bool = False
     extra_channels: tuple[Channel, ...] = ()
 
-    @property
+    @cached_property
     def compared_channels(self) -> tuple[str, ...]:
         """Names of the compared channels, in the order of a Comparison."""
         return (*COMPARED_CHANNELS, *(channel.name for channel in self.extra_channels))

@@ -8,7 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from table_io.acquisition.session import OperatorCommand, find_take_back, run_session
+from table_io.acquisition.session import (
+    CommandSource,
+    OperatorCommand,
+    SessionOutput,
+    find_take_back,
+    run_session,
+)
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
@@ -96,6 +102,22 @@ def add_twin_items(
             yield from items
 
 
+def iter_simulated_session(
+    config: RunConfig, run: str, commands: CommandSource = lambda: None
+) -> SessionOutput:
+    """Yield what a session on the simulated table yields, from decision to decision."""
+    clock = ManualClock()
+    backend = open_backend(config.rig, config.profile, clock)
+    return run_session(
+        config.session_setup,
+        backend,
+        clock,
+        config.make_start_factory(run, "table"),
+        commands,
+        take_back=find_take_back(backend, clock),
+    )
+
+
 def play_unpaced(
     config: RunConfig,
     run: str,
@@ -105,23 +127,12 @@ def play_unpaced(
 ) -> None:
     """Run the test on a simulated table at full speed, recorded to `path`."""
     check_full_speed(config.rig)
-    clock = ManualClock()
-    backend = open_backend(config.rig, config.profile, clock)
 
     def poll_command() -> OperatorCommand | None:
         return OperatorCommand("stop", why) if (why := poll_interrupt()) else None
 
-    source = run_session(
-        config.session_setup,
-        backend,
-        clock,
-        config.make_start_factory(run, "table"),
-        poll_command,
-        take_back=find_take_back(backend, clock),
-    )
-    record_items(
-        add_twin_items(source, config.prepare_twin()), path, run, config.drive.rate_hz, on_item
-    )
+    items = add_twin_items(iter_simulated_session(config, run, poll_command), config.prepare_twin())
+    record_items(items, path, run, config.drive.rate_hz, on_item)
 
 
 def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler) -> None:

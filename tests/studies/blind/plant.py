@@ -18,7 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from table_io.acquisition.session import TARE_S, RunDescriber, run_session
+from table_io.acquisition.session import TARE_S, RunDescriber
 from table_io.backends import Backend, open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
@@ -55,6 +55,7 @@ from tests.studies.blind.sizes import (
 )
 from twin.recording.mcap_log import write_items
 from twin.setup.run_config import RunConfig, from_texts
+from twin.setup.unpaced import iter_simulated_session
 
 TRUTH_DIGITS = 6  # significant digits of a number in the truth
 # Base parameter of a case -> key of a truth, and of the nominal rig.
@@ -311,13 +312,11 @@ def record_test(
 ) -> RunStop:
     """Record a test, by default the study's, on the machine of a rig config; return its end."""
     bundle = from_texts("case", profile_toml, rig, MODEL_TOML, f"case {label}")
-    clock = ManualClock()
-    backend = open_backend(bundle.rig, bundle.profile, clock)
-    make_start = bundle.make_start_factory(label, "table")
     if is_protected:
-        start, *rest = run_session(bundle.session_setup, backend, clock, make_start, lambda: None)
+        start, *rest = iter_simulated_session(bundle, label)
     else:
-        start, *rest = play_unprotected(bundle, backend, make_start)
+        backend = open_backend(bundle.rig, bundle.profile, ManualClock())
+        start, *rest = play_unprotected(bundle, backend, bundle.make_start_factory(label, "table"))
     assert not isinstance(start, RunStop)
     write_items(log, [start, *rest], start)  # type: ignore[arg-type]
     stop = rest[-1]
