@@ -7,8 +7,10 @@ command answers it a fixed horizon later, so a sine-like deviation is answered a
     c(t) = share Re((g + i w d) E exp(i w (t - horizon)))
 
 Every block gives such a function. It replaces the previous one by a quintic blend, so the command
-stays C2, and it fades to zero if no later block replaces it. The amplitude of the correction and
-its change from block to block are limited.
+stays C2, and it fades to zero if no later block replaces it. The amplitude of the correction is
+limited, and so is the acceleration of what is written, whether it comes from a deviation, from the
+share or from a fade: the blend to the next function is as long as that needs, and beyond the
+longest one a block replaces only a part of the previous function.
 
 Why x and not u = x - y: at frequencies above its resonance the mass stands still, so u = -y returns
 the correction at a gain of about -g with the delay of the loop, which is close to instability.
@@ -23,10 +25,11 @@ import numpy as np
 from table_io.block import Float1D, Int1D
 from table_io.config.excitation.orbit_plan import unpack_harmonics
 from table_io.config.excitation.waveform import smoothstep
-from table_io.excitation.drive import MAX_BLEND_CURVATURE, Correction, Drive
+from table_io.excitation.drive import Correction, Drive
 
 WINDOW_S = 0.03  # of the fit: longer rejects more noise, shorter follows a faster growth
 BLEND_S = 0.02  # from the previous function to the next
+BLEND_FACTORS = (1.0, 1.5, 2.25, 3.5, 5.0)  # on it: the first that the acceleration allows
 PREDICTION_S = 0.05  # after the horizon, until the function fades if no block replaces it
 FADE_S = 0.15
 
@@ -48,7 +51,7 @@ class ReferenceSegment:
     gain: float
     rate_gain_s: float
     limit_m: float  # amplitude of the correction
-    max_acceleration_m_s2: float  # that a change of the correction may add
+    max_acceleration_m_s2: float  # of the correction as it is written
 
     def share(self, indices: Int1D) -> Float1D:
         """Return the share at sample indices, (sample,)."""
@@ -81,8 +84,7 @@ class FeedbackState:
     horizon: int  # samples from the end of a block to the first one that it corrects
     segments: tuple[ReferenceSegment, ...] = ()
     deviation_m: Float1D = field(default_factory=lambda: np.empty(0))
-    phasor_m: complex = 0j  # of the correction, at sample `index` of the horizon
-    index: int = 0
+    index: int = 0  # end of the last block that was answered
     saturated_samples: int = 0  # since the limit was last not reached
 
     def append(self, segment: ReferenceSegment) -> "FeedbackState":
@@ -127,18 +129,41 @@ def advance_feedback(
     if not w or deviation.size < window or not np.isfinite(deviation).all():
         return state, drive.correction, start
     rotation = np.exp(1j * w * np.arange(-window, 0) / rate_hz)
-    demanded = complex(segment.gain, w * segment.rate_gain_s) * _fit_phasor(deviation, rotation)
-    state = _limit_phasor(state, demanded, segment, end, w / rate_hz, rate_hz)
+    phasor = complex(segment.gain, w * segment.rate_gain_s) * _fit_phasor(deviation, rotation)
+    is_saturated = abs(phasor) > segment.limit_m
+    if is_saturated:
+        phasor *= segment.limit_m / abs(phasor)
+    saturated = state.saturated_samples + end - state.index if is_saturated else 0
+    state = replace(state, index=end, saturated_samples=saturated)
     count = round((PREDICTION_S + FADE_S) * rate_hz) + max(start - end - state.horizon, 0)
     indices = np.arange(start, start + count)
-    values = np.real(
-        state.phasor_m * np.exp(1j * w * (indices - end - state.horizon) / rate_hz)
-    ) * (1.0 - smoothstep((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0))
+    values = np.real(phasor * np.exp(1j * w * (indices - end - state.horizon) / rate_hz)) * (
+        1.0 - smoothstep((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0)
+    )
     values *= segment.share(indices)
-    blend = smoothstep(np.arange(count) / (BLEND_S * rate_hz))
-    previous = drive.correction.displacement(start, count)
-    values = previous + (values - previous) * blend
+    # Two samples before and after, so that every second difference that changes is among these.
+    previous = drive.correction.displacement(start - 2, count + 4)
+    difference = np.pad(values - previous[2:-2], 2)
+    limit = segment.max_acceleration_m_s2 / rate_hz**2
+    for factor in BLEND_FACTORS:
+        blend = smoothstep(np.arange(-2, count + 2) / (factor * BLEND_S * rate_hz))
+        share = _limit_change(previous, difference * blend, limit)
+        if share == 1.0:
+            break
+    values = (previous + share * difference * blend)[2:-2]
     return state, drive.correction.replace_from(start, values, keep_from), start
+
+
+def _limit_change(previous: Float1D, change: Float1D, limit: float) -> float:
+    """Return the largest part of a change, 0 to 1, that keeps second differences within a limit.
+
+    previous, change: (sample,) in m. Where the previous function is beyond the limit, which has
+    fallen, the change may not add to it.
+    """
+    before, added = np.diff(previous, 2), np.diff(change, 2)
+    room = np.maximum(limit, np.abs(before)) - np.sign(added) * before
+    size = np.abs(added)
+    return float(min(1.0, np.min(room[size > 0.0] / size[size > 0.0], initial=1.0)))
 
 
 def _fit_phasor(deviation: Float1D, rotation: Float1D) -> complex:
@@ -148,27 +173,3 @@ def _fit_phasor(deviation: Float1D, rotation: Float1D) -> complex:
     normal, rhs = np.einsum("ij,ik->jk", basis, basis), np.einsum("ij,i->j", basis, deviation)
     real, imaginary = np.linalg.solve(normal, rhs)
     return complex(real, imaginary)
-
-
-def _limit_phasor(
-    state: FeedbackState,
-    demanded: complex,
-    segment: ReferenceSegment,
-    end: int,
-    turn: float,
-    rate_hz: float,
-) -> FeedbackState:
-    """Return the state with the demanded phasor in m, limited in size and change.
-
-    `turn` is the angle per sample in rad.
-    """
-    size = abs(demanded)
-    is_saturated = size > segment.limit_m
-    phasor = demanded * segment.limit_m / size if is_saturated else demanded
-    previous = state.phasor_m * np.exp(1j * turn * (end - state.index)) if state.index else 0j
-    max_change = segment.max_acceleration_m_s2 * BLEND_S**2 / MAX_BLEND_CURVATURE
-    change = phasor - previous
-    if abs(change) > max_change:
-        phasor = previous + change * max_change / abs(change)
-    saturated = state.saturated_samples + end - state.index if is_saturated else 0
-    return replace(state, phasor_m=complex(phasor), index=end, saturated_samples=saturated)

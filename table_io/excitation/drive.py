@@ -261,6 +261,18 @@ def segment_motion(segment: Segment, x: Float1D, rate_hz: float) -> tuple[Float1
     return v_sin * sin + v_cos * cos, a_sin * sin + a_cos * cos
 
 
+def envelope_acceleration(
+    segment: Segment, x: Float1D, rate_hz: float, levels: tuple[float, float] | None = None
+) -> Float1D:
+    """Return the acceleration in m/s2 at the worst phase at the fractions x of a segment, (x,).
+
+    levels: in m/s2 at the ends of the segment; None: the demanded ones.
+    """
+    levels = (segment.level0, segment.level1) if levels is None else levels
+    _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
+    return np.hypot(a_sin, a_cos)
+
+
 def peak_acceleration_ratio(segment: Segment, rate_hz: float) -> float:
     """Return the peak acceleration of a segment at its worst phase over the larger of its levels.
 
@@ -270,8 +282,8 @@ def peak_acceleration_ratio(segment: Segment, rate_hz: float) -> float:
     x = np.linspace(0.0, 1.0, 401)
     ratios = []
     for levels in ((segment.level0, segment.level1), _command_levels(segment)):
-        _, _, a_sin, a_cos = _quadratures(segment, x, rate_hz, levels)
-        ratios.append(float(np.hypot(a_sin, a_cos).max()) / max(levels))
+        envelope = envelope_acceleration(segment, x, rate_hz, levels)
+        ratios.append(float(envelope.max()) / max(levels))
     return max(ratios)
 
 

@@ -2,11 +2,11 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from table_io.block import Float2D
+from table_io.block import Float2D, Label
 from table_io.config.excitation import History
 from table_io.config.excitation.drive_file import DRIVE_KEY, DRIVE_REMEDY
 from table_io.config.excitation.waveform import smoothstep
@@ -15,7 +15,7 @@ from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.order_tracking import evaluate_gain
 from table_io.errors import InputError
-from table_io.excitation.drive import Drive, HistorySegment, Segment
+from table_io.excitation.drive import Drive, HistorySegment, Segment, envelope_acceleration
 from table_io.records import FrequencyResponse, Step
 from table_io.safety.loop_check import plan_targets
 from table_io.units import GRAVITY_M_S2
@@ -110,18 +110,42 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
         _build_demand(Step(-1, LOOP_CHECK, f, check_levels[f]), segment_peaks, mass, rig)
         for f, segment_peaks in sorted(check_peaks.items())
     ]
-    # Feedback adds to the command, in any phase.
-    share = 1.0 if profile.continuation is None else 1.0 + profile.continuation.max_feedback
     for step in drive.steps:
-        peaks_of_step = [
-            (share * disp, share * speed, share * acceleration)
-            for disp, speed, acceleration in step_peaks.get(step.index, [_steady_peaks(step)])
-        ]
+        peaks_of_step = step_peaks.get(step.index, [_steady_peaks(step)])
+        if profile.continuation is not None:
+            largest = tuple(max(values) for values in zip(*peaks_of_step, strict=True))
+            share = profile.continuation.max_feedback
+            peaks_of_step = [_add_feedback(step, largest, share, drive.rate_hz)]
         rows.append(_build_demand(step, peaks_of_step, mass, rig))
     for history in drive.segments:
         if isinstance(history, HistorySegment):
             rows += _history_demands(history, drive.rate_hz, mass, rig)
     return tuple(rows)
+
+
+def _add_feedback(
+    step: Step, peaks: tuple[float, ...], share: float, rate_hz: float
+) -> tuple[float, float, float]:
+    """Return the bounds of (displacement, velocity, acceleration) with a feedback, SI.
+
+    The feedback c is added in any phase. Its amplitude and its acceleration are limited to a share
+    of the held step (`control/orbit_feedback.py`); |c'| <= sqrt(2 max|c| max|c''|) for any motion
+    that begins and ends at rest. A decay g of both, from anywhere, has (g c)'' too.
+    """
+    d, v, a = (share * peak for peak in _steady_peaks(step))
+    stop = Segment(0, 1, Label.STOP, step.index, step.frequency_hz, step.frequency_hz,
+                   step.acceleration_m_s2, 0.0, 0.0)  # fmt: skip
+    x = np.linspace(0.0, 1.0, 401)
+    seconds = stop.decay_samples(0.0, rate_hz) / rate_hz
+    slope = 30.0 * x**2 * (1.0 - x) ** 2 / seconds
+    curvature = 60.0 * np.abs(x * (1.0 - x) * (1.0 - 2.0 * x)) / seconds**2
+    decaying = a * (1.0 - smoothstep(x)) + 2.0 * slope * math.sqrt(2.0 * a * d) + curvature * d
+    decaying += envelope_acceleration(replace(stop, count=round(seconds * rate_hz)), x, rate_hz)
+    return (
+        peaks[0] + d,
+        peaks[1] + math.sqrt(2.0) * v,
+        max(peaks[2] + a, float(decaying.max())),
+    )
 
 
 def _history_demands(

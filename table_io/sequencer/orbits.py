@@ -223,7 +223,7 @@ def _append_orbit(
         orbit.gain,
         orbit.rate_gain_s,
         config.max_feedback * command_m,
-        orbit.acceleration_m_s2,
+        config.max_feedback * sine.corrected_m_s2,
     )
     return trajectory, feedback.append(segment)
 

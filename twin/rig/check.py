@@ -114,7 +114,7 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
         )
     return [
         ("specimen", f"{profile.specimen.mass_kg:g} kg, {bumpers}"),
-        *_excitation_lines(profile),
+        *_excitation_lines(config),
         ("loop check", check),
         ("duration", _format_duration(config)),
         (
@@ -128,13 +128,15 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
     ]
 
 
-def _excitation_lines(profile: Profile) -> list[tuple[str, str]]:
+def _excitation_lines(config: RunConfig) -> list[tuple[str, str]]:
+    profile = config.profile
     if profile.continuation is not None:
-        return _orbit_lines(profile.continuation)
+        peak_m_s2 = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
+        return _orbit_lines(profile.continuation, peak_m_s2 / GRAVITY_M_S2)
     return _sweep_lines(profile) if profile.steps else _history_lines(profile)
 
 
-def _orbit_lines(config: Continuation) -> list[tuple[str, str]]:
+def _orbit_lines(config: Continuation, peak_g: float) -> list[tuple[str, str]]:
     plan = config.orbit_plan
     orbits = plan.points
     unstable = [orbit for orbit in orbits if not orbit.stable]
@@ -150,7 +152,8 @@ def _orbit_lines(config: Continuation) -> list[tuple[str, str]]:
         ),
         (
             "feedback",
-            f"at most {100 * config.max_feedback:g} % of the command; planned for a latency of "
+            f"at most {100 * config.max_feedback:g} % of the command and of its acceleration, "
+            f"never above {peak_g:.4g} g with it, stops included; planned for a latency of "
             f"{1e3 * plan.latency_s:.3g} ms and {1e3 * plan.jitter_s:.3g} ms of jitter",
         ),
         ("level", f"{extent}{max(levels_g):.4g} g peak table acceleration"),

@@ -44,7 +44,10 @@ class Continuation(Excitation):
         0.003, gt=0, le=0.05, description="Accepted feedback over the amplitude of the command."
     )
     max_feedback: Number = Field(
-        0.5, gt=0, le=1.0, description="Largest feedback over the amplitude of the command."
+        0.5,
+        gt=0,
+        le=1.0,
+        description="Largest feedback over the command: in amplitude, and in acceleration.",
     )
     multiplier_periods: Count = Field(
         24,

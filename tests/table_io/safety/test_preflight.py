@@ -14,7 +14,7 @@ from table_io.block import Float1D, Label
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.excitation.drive import Drive, HistorySegment, Segment
+from table_io.excitation.drive import Correction, Drive, HistorySegment, Segment
 from table_io.excitation.trajectory import plan_excitation, plan_sweep
 from table_io.records import FrequencyResponse, Step
 from table_io.safety import preflight
@@ -138,17 +138,52 @@ def test_step_that_is_not_played_yet_counts_with_its_held_cycles() -> None:
         assert row.amplitude_lsb == pytest.approx(held[0] / RIG.output.lsb_m)
 
 
+def make_controlled(share: float) -> Any:
+    """Return a test whose steps are held with feedback of a share of their command."""
+    continuation = SimpleNamespace(max_feedback=share)
+    return SimpleNamespace(specimen=make_test().specimen, continuation=continuation)
+
+
 def test_feedback_adds_to_every_demand_of_a_step_and_to_no_loop_check() -> None:
     test = make_test()
-    continuation = SimpleNamespace(max_feedback=0.4)
-    controlled: Any = SimpleNamespace(specimen=test.specimen, continuation=continuation)
     drive = nominal_drive(make_test_plan(test, RIG))
     plain_rows = compute_demands(drive, test, RIG)
-    for plain, row in zip(plain_rows, compute_demands(drive, controlled, RIG), strict=True):
-        factor = 1.4 if plain.step >= 0 else 1.0
-        for name in ("displacement_m", "velocity_m_s", "acceleration_m_s2", "force_n"):
-            assert getattr(row, name) == pytest.approx(factor * getattr(plain, name)), name
+    for plain, row in zip(
+        plain_rows, compute_demands(drive, make_controlled(0.4), RIG), strict=True
+    ):
+        share = 0.4 if plain.step >= 0 else 0.0
+        w = 2 * math.pi * plain.frequency_hz
+        d, v, a = motion_of(row)
+        d0, v0, a0 = motion_of(plain)
+        level = LEVEL_M_S2
+        assert d == pytest.approx(d0 + share * level / w**2)
+        assert v == pytest.approx(v0 + share * math.sqrt(2.0) * level / w)
+        assert a0 + share * level <= a * (1 + 1e-9)
+        assert a <= a0 + 1.18 * share * level
+        assert row.force_n == pytest.approx(2550.0 * a)
         assert row.amplitude_lsb == plain.amplitude_lsb  # of the smallest, without feedback
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_stop_from_anywhere_with_the_largest_feedback_stays_within_the_demand(seed: int) -> None:
+    """Corrections of bounded amplitude and acceleration, in any phase, that end in a decay."""
+    rng, rate_hz, f, share = np.random.default_rng(seed), 1000.0, 2.0, 0.4
+    level, w = LEVEL_M_S2, 2 * math.pi * f
+    hold = Segment(0, 8000, Label.SETTLE, 0, f, f, level, level, 0.0, 16)
+    t = np.arange(6000) / rate_hz
+    edge = np.sin(np.pi * np.arange(6000) / 6000) ** 3
+    other = 2 * math.pi * rng.uniform(0.5, 6.0)
+    wave = -np.sin(w * t + rng.uniform(-0.5, 0.5)) + rng.random() * np.sin(other * t)
+    wave *= edge
+    largest = max(
+        np.abs(wave).max() * w**2 / level, np.abs(np.diff(wave, 2)).max() * rate_hz**2 / level
+    )
+    correction = Correction(1000, wave * share / largest)
+    drive = Drive(rate_hz, (hold,), (Step(0, "forward", f, level),), correction=correction)
+    (row,) = compute_demands(drive, make_controlled(share), RIG)
+    peaks = [np.abs(differentiate(drive.decay_from(at).command(at - 500, 2000), rate_hz)[2]).max()
+             for at in range(3000, 5000, 37)]  # fmt: skip
+    assert 0.7 * row.acceleration_m_s2 < max(peaks) <= row.acceleration_m_s2 * (1 + 1e-6)
 
 
 def test_loop_check_has_its_rows_before_the_steps() -> None:
