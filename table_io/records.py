@@ -421,7 +421,7 @@ LABEL_TEXTS = {
     Label.CHECK: "loop check",
 }
 SEVERITY_KINDS = {
-    "ERROR": {"fault", "halted", "error", "died"},
+    "ERROR": {"fault", "halted", "error", "died", "twin_failed"},
     "WARN": {
         "warning", "calibration", "alarm", "divergence", "late", "stop", "stopped", "sensor",
         "disagreement", "drift", "no jump", "unexpected jump", "attractor", "instrument", "refused",

@@ -4,7 +4,7 @@ Pure: the same samples give bit-identical items for any division into blocks. Li
 `--speed max` call this same function.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
@@ -39,7 +39,9 @@ from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import RangeKey, find_range_exits, list_ranges
 
 CycleBlocks = tuple[Block, ...]  # the same samples measured, predicted, and without low cuts
-EVENT_KINDS = (*monitoring.EVENT_KINDS, valid_range.EVENT_KIND)  # of the pipeline
+FAILURE_KIND = "twin_failed"  # a prediction that is not finite, on finite input
+EVENT_KINDS = (*monitoring.EVENT_KINDS, valid_range.EVENT_KIND, FAILURE_KIND)  # of the pipeline
+TWIN_TITLES = {"free": "the free-running twin", "window": "the restarted twin"}
 MAX_MISSING_SAMPLES = 3  # samples that a whole held cycle may lack
 
 
@@ -164,8 +166,9 @@ def step(
 
     Records: Comparison, PredictionHash, CycleExtremes, PrcPoint and those of the monitoring.
     """
+    known_failures = state.twins.failures
     if block.index != state.twins.index:
-        twins = start_twins(setup.twin, block.index)
+        twins = replace(start_twins(setup.twin, block.index), failures=known_failures)
         state = PipelineState(
             twins,
             monitoring=state.monitoring,
@@ -188,10 +191,27 @@ def step(
         compared.extend(comparisons)
     predicted = join_blocks(pieces)
     state, events = _watch_ranges(setup, state, block, predicted)
+    events += _list_failures(setup, state, known_failures)
     cell_samples = HASHED_BLOCKS * setup.twin.grid_samples
     unhashed, hashes = hash_cells(state.unhashed, block.end, predicted.values, cell_samples)
     state = replace(state, unhashed=unhashed)
     return state, [predicted, *compared, *hashes, *records, *events]
+
+
+def _list_failures(
+    setup: PipelineSetup, state: PipelineState, known: Container[str]
+) -> list[Record]:
+    """Return an event for each twin that has failed and is not among the known."""
+    return [
+        Event(
+            sample,
+            FAILURE_KIND,
+            f"{TWIN_TITLES[name]} failed from sample {sample} ({sample / setup.twin.rate_hz:.3f} "
+            "s): its prediction is not finite",
+        )
+        for name, sample in state.twins.failures.items()
+        if name not in known
+    ]
 
 
 def _watch_ranges(

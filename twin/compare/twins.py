@@ -5,7 +5,8 @@ every sample index that is a multiple of the window, so it can be compared sampl
 the motion is chaotic. Both begin at the first such index with enough measured history.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +23,7 @@ from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT, Solver, StateEstimate
 
 HISTORY_S = 0.1  # of measured motion, from which a restart estimates u and u'
+PREDICTED_ROWS = 5  # of a solver's: u, v, a, F_R, F_L
 MEMORY_RELAXATION_TIMES = 8.0  # after which a bumper has forgotten a contact
 
 
@@ -74,7 +76,7 @@ class TwinStates:
     """State of both twins before sample `index`; `past` holds u, a - A, A, F_R, F_L (5, n).
 
     `lag_history` holds the last samples of the prediction without sensor effects, as many as a lag
-    needs.
+    needs. `failures`: the first sample, by twin, at which it was not finite on finite input.
     """
 
     index: int
@@ -83,6 +85,7 @@ class TwinStates:
     past: Float2D
     squares: Float2D  # (3, channel, sample) of the unfinished grid cell
     lag_history: Float2D
+    failures: Mapping[str, int] = field(default_factory=dict)
 
 
 def start_twins(setup: TwinSetup, index: int) -> TwinStates:
@@ -181,26 +184,41 @@ def _restart_window(
 
 
 def _is_lost(state: Float1D | None) -> bool:
-    return state is None or bool(np.isnan(state).any())
+    return state is None or not np.isfinite(state).all()
 
 
 def _advance_twin(
     state: Float1D | None, setup: TwinSetup, base_acc: Float1D, table_disp: Float1D
-) -> Float2D:
-    """Advance `state` in place; return the solver's rows (7, sample)."""
+) -> tuple[Float2D, int | None]:
+    """Advance `state` in place; return the solver's rows (7, sample), and the sample that failed.
+
+    The first at which the prediction, or its square, is not finite, though state and input were.
+    """
     out = np.full((OUTPUT_COUNT, base_acc.size), np.nan)
-    if state is not None:
-        setup.solver.advance(state, base_acc, table_disp, out)
-    return out
+    if state is None:
+        return out, None
+    was_known = not _is_lost(state)
+    setup.solver.advance(state, base_acc, table_disp, out)
+    predicted = out[:PREDICTED_ROWS]
+    failed = ~np.isfinite(predicted * predicted).all(axis=0)
+    first = int(failed.argmax())
+    if not (was_known and failed[first]):
+        return out, None
+    inputs = [base_acc]
+    if setup.model.uses_table_displacement:
+        inputs.append(table_disp)
+    is_input_known = all(np.isfinite(values[: first + 1]).all() for values in inputs)
+    return out, first if is_input_known else None
 
 
 def _twin_channels(out: Float2D, table_disp: Float1D) -> list[Float1D]:
     """Return the solver's rows as the predicted channels of one twin."""
-    u, v, a, force_r, force_l = out[:5]
+    u, v, a, force_r, force_l = out[:PREDICTED_ROWS]
     half_r, half_l = 0.5 * force_r, -0.5 * force_l
     return [u, v, table_disp + u, a, half_r, half_r, half_l, half_l]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of a twin that fails, which is reported
 def advance_twins(
     setup: TwinSetup, twins: TwinStates, block: Block
 ) -> tuple[TwinStates, Block, list[Comparison]]:
@@ -219,7 +237,8 @@ def advance_twins(
 
     free = None if twins.free is None else twins.free.copy()
     window = None if twins.window is None else twins.window.copy()
-    free_out, window_out = [], []
+    outputs: dict[str, list[Float2D]] = {name: [] for name in TWIN_NAMES}
+    failures = dict(twins.failures)
     first_restart = -block.index % setup.window_samples
     ends = [*range(first_restart + 1, n + 1, setup.window_samples), n]
     start = 0
@@ -227,8 +246,11 @@ def advance_twins(
         if start == end:
             continue
         drive = base_acc[start:end], table_disp[start:end]
-        free_out.append(_advance_twin(free, setup, *drive))
-        window_out.append(_advance_twin(window, setup, *drive))
+        for name, state in zip(TWIN_NAMES, (free, window), strict=True):
+            out, failed = _advance_twin(state, setup, *drive)
+            outputs[name].append(out)
+            if failed is not None:
+                failures.setdefault(name, block.index + start + failed)
         if (block.index + end - 1) % setup.window_samples == 0 and not setup.from_rest:
             history = past[
                 :, max(past_samples + end - setup.history_samples, 0) : past_samples + end
@@ -240,7 +262,7 @@ def advance_twins(
             if _is_lost(free):
                 free = restarted
         start = end
-    twin_rows = (np.concatenate(out, axis=1) for out in (free_out, window_out))
+    twin_rows = (np.concatenate(rows, axis=1) for rows in outputs.values())
     true_values = np.array([row for out in twin_rows for row in _twin_channels(out, table_disp)])
     values = _apply_model_sensors(setup, block, true_values, twins.lag_history)
     predicted = Block(
@@ -263,6 +285,7 @@ def advance_twins(
         past=past[:, max(past.shape[1] - setup.history_samples, 0) :],
         squares=squares,
         lag_history=keep_last(true_values, twins.lag_history, setup.delay_samples),
+        failures=failures,
     )
     return after, predicted, comparisons
 

@@ -166,6 +166,11 @@ class Model:
     def _input_effects(self) -> tuple[EffectInstance, ...]:
         return tuple(i for i in self.present_effects if i.effect.place == "input")
 
+    @property
+    def uses_table_displacement(self) -> bool:
+        """Return whether the motion depends on the displacement of the table."""
+        return bool(self._input_effects)
+
     @overload
     def added_acceleration(self, table_disp: float) -> float | None: ...
     @overload

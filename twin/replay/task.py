@@ -20,6 +20,7 @@ from twin.results import summary as summaries
 from twin.results.contracts import ReplayResult
 from twin.results.recordings import read_recorded_config, warn_if_damaged
 from twin.results.rerun import DRIVE_CHANNEL
+from twin.results.twin_verdict import list_failed_twins
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import Observe, ShownRun, observe_nothing
@@ -145,5 +146,6 @@ def describe_replay(
             config.parameters,
             config.rig.channel_by_name,
             summaries.find_channel_noise(recording),
+            list_failed_twins(recording),
         ),
     )

@@ -63,6 +63,7 @@ from twin.results.twin_verdict import (
     find_clipped_cycles,
     judge_twin,
     list_clipped_channels,
+    list_failed_twins,
     sum_free_errors,
     summarise_agreement,
 )
@@ -84,19 +85,17 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
     noise = find_channel_noise(recording)
     channels = read_channels(start.rig_toml)
     clipped = find_clipped_cycles(recording)
-    agreement = summarise_agreement(
-        recording,
-        parameters,
-        profile,
-        {name: _compared_noise(noise, name) for name in COMPARED_CHANNELS},
-        clipped,
-    )
+    failed = list_failed_twins(recording)  # their finite samples alone are no score
+    agreement = {}
+    if "window" not in failed:
+        rms = {name: _compared_noise(noise, name) for name in COMPARED_CHANNELS}
+        agreement = summarise_agreement(recording, parameters, profile, rms, clipped)
 
     demanded: dict[int, Step | StepAdded] = {step.index: step for step in start.steps}
     demanded |= {addition.step: addition for addition in recording.records(StepAdded)}
     measured_cycles = profile.sweep.measured_cycles if start.steps and points else 0
     free_errors = sum_free_errors(
-        recording.records(Comparison),
+        () if "free" in failed else recording.records(Comparison),
         points,
         {index: measured_cycles / step.frequency_hz for index, step in demanded.items()},
         start.rate_hz,
@@ -151,12 +150,16 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
         twin_jumps=make_jumps(twin_jumps),
         twin_hysteresis=make_intervals(twin_intervals),
         timing=summarise_timing(recording.records(Timing)),
-        comparison=channel_nrmse(recording.records(Comparison), parameters, channels, noise),
+        comparison=channel_nrmse(
+            recording.records(Comparison), parameters, channels, noise, failed
+        ),
         estimates=_list_estimates(recording.records(Estimate)),
         warnings=_list_warnings(recording, clipped),
     )
     if not start.steps:
-        compare = partial(channel_nrmse, parameters=parameters, channels=channels, noise=noise)
+        compare = partial(
+            channel_nrmse, parameters=parameters, channels=channels, noise=noise, failed=failed
+        )
         summary.windows = summarise_windows(recording, profile.comparison.contact_n, compare)
         summary.tracking = summarise_tracking(recording, profile)
     if profile.continuation is not None:
@@ -347,6 +350,7 @@ def channel_nrmse(
     parameters: Parameters,
     channels: Mapping[str, Channel],
     noise: ChannelNoise,
+    failed: Container[str] = (),
 ) -> dict[str, ChannelError]:
     """Return the NRMSE by channel: `nrmse` of the restarted twin, `free_nrmse` of the free one.
 
@@ -354,8 +358,8 @@ def channel_nrmse(
     the displacement relative to the table, because the motion of the table is measured and no
     prediction. The restarted twin shows the model error; the free one also the divergence between
     solutions. `noise_floor` is what the noise of the sensors alone would leave, as it is at rest.
-    None for the force on an absent bumper, which is noise only. `channels` is the registry of the
-    rig.
+    None for the force on an absent bumper, which is noise only, and of a twin that is among those
+    that `failed`. `channels` is the registry of the rig.
     """
     gaps = {"right_bumper": parameters.gap_r, "left_bumper": parameters.gap_l}
     absent = {
@@ -381,9 +385,11 @@ def channel_nrmse(
         rms = _compared_noise(noise, name)
         is_comparable = name not in absent
         errors[name] = ChannelError(
-            nrmse=_compute_nrmse(window[:, column], measured[:, column]) if is_comparable else None,
+            nrmse=_compute_nrmse(window[:, column], measured[:, column])
+            if is_comparable and "window" not in failed
+            else None,
             free_nrmse=_compute_nrmse(free[:, column], measured[:, column])
-            if is_comparable
+            if is_comparable and "free" not in failed
             else None,
             noise_floor=rms * math.sqrt(counts[is_known].sum() / total)
             if total > 0 and is_comparable

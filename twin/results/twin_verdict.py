@@ -12,6 +12,7 @@ It agrees if all of this holds, and every surface shows what is said here:
   motion itself, that is a phase within 60 degrees.
 - Every jump is in its place: within a step of the grid, and within 2 % of its frequency.
 - The monitoring has not warned of a disagreement.
+- No prediction was without a finite value where the input had one: such a twin has failed.
 - The excitation was reached (`excitation_verdict`): else the twin followed another test.
 
 At least half of the measured steps must be judged. A displacement history has no cycles: its NRMSE
@@ -34,7 +35,7 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement, Comparison, PrcPoint
+from table_io.records import Agreement, Comparison, Event, PrcPoint
 from twin.compare.curves import MIN_JUMP_RATIO
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
@@ -45,6 +46,7 @@ from twin.compare.monitoring.agreement import (
 )
 from twin.compare.monitoring.cycle import ChannelNoise
 from twin.compare.monitoring.jumps import JUMP_TOLERANCE, measure_separation
+from twin.compare.pipeline import FAILURE_KIND, TWIN_TITLES
 from twin.model.parameters import Parameters
 from twin.recording.reader import Recording
 from twin.results.contracts import (
@@ -109,6 +111,14 @@ def summarise_agreement(
         )
         for step, records in by_step.items()
     }
+
+
+def list_failed_twins(recording: Recording) -> list[str]:
+    """Return the names of the twins of which a prediction was not finite on finite input."""
+    texts = [event.text for event in recording.records(Event) if event.kind == FAILURE_KIND]
+    return [
+        name for name, title in TWIN_TITLES.items() if any(text.startswith(title) for text in texts)
+    ]
 
 
 def list_clipped_channels(recording: Recording) -> list[str]:
@@ -278,7 +288,8 @@ def judge_twin(summary: RunSummary) -> TwinVerdict:
         if warning.kind == DEPARTURE_KIND and not warning.is_clipped
     ]
     judged = _count_judged(summary)
-    reasons = []
+    failures = [warning.text for warning in summary.warnings if warning.kind == FAILURE_KIND]
+    reasons = failures[:1]
     if outside:
         reasons.append(f"{len(outside)} of {judged} steps outside the tolerance")
     elif worst and worst.share > 1:
@@ -299,9 +310,11 @@ def judge_twin(summary: RunSummary) -> TwinVerdict:
     misfits = _list_misfits(summary)
     misfit = float(np.median(misfits)) if misfits else None
     verdict: Verdict = "not judged"
-    if summary.run.source == "model" or (worst is None and not apart):
+    if failures and summary.run.source == "model":
+        pass
+    elif summary.run.source == "model" or not (worst or apart or failures):
         reasons = [_explain_no_tolerance(summary)]
-    elif not planned and summary.clipped_channels:
+    elif not planned and summary.clipped_channels and not failures:
         reasons = [f"off the range of their sensor: {', '.join(summary.clipped_channels)}"]
     elif reasons:
         verdict = "departs"

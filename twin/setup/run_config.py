@@ -25,6 +25,7 @@ from twin.model.config import ModelConfig, load_model_config
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.recording.log_metadata import RECORDED_EVERY
+from twin.setup.law_limits import check_laws
 from twin.system.versions import read_installed_versions
 
 if TYPE_CHECKING:
@@ -203,6 +204,10 @@ def build_run_config(
             raise
         raise error.replace(remedy=f"{error.remedy}, or correct {model_path}") from None
     check_drive_rig(config.profile, config.rig, source)
+    try:
+        check_laws(config.model, config.profile)
+    except InputError as error:
+        raise error.add_place(str(model_path)) from None
     try:
         check_limits(config.margins, config.profile, config.rig, source)
     except InputError as error:

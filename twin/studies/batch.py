@@ -23,6 +23,7 @@ from twin.model.parameters import free_flight_resonance
 from twin.model.valid_range import RangeExit, select_first_exits
 from twin.results import ideal_points
 from twin.results.summary import make_intervals, make_jumps
+from twin.setup.law_limits import check_laws
 from twin.setup.run_config import read_model
 from twin.studies.result import (
     IMPACT_COLUMNS,
@@ -189,6 +190,7 @@ def _require_simulable(case: StudyCase, profile: Profile, context: str) -> None:
     try:
         free_flight_resonance(model.parameters, 1.0)
         model.check_rate(profile.acquisition.rate_hz)
+        check_laws(model, profile)
         simulate_sweep(model, [slowest_hz], 0.0, 1)
     except InputError as error:
         raise error.add_place(f"{context}: {case.name}") from None

@@ -113,9 +113,14 @@ class CaseChunk:
         sweep, frequencies = self.sweep, self.sweep.frequencies_hz
 
         def simulate(_: int, case: SampledCase) -> FloatND:
-            return simulate_sweep(
+            extremes = simulate_sweep(
                 case.model, frequencies, case.acceleration_m_s2, sweep.cycles, sweep.measured_cycles
             ).extremes
+            is_finite = np.isfinite(extremes).all(axis=(1, 2))
+            if not is_finite.all():
+                first = frequencies[is_finite.argmin()]
+                raise InputError(f"the model has no finite response from {first:g} Hz on")
+            return extremes
 
         return self.collect(simulate, (len(sweep.steps), sweep.measured_cycles, len(EXTREME_NAMES)))
 
