@@ -49,9 +49,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.timeout(SLOW_TIMEOUT_S))
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def forget_entry_points() -> Iterator[None]:
-    """Scan the installed packages anew: a test may install some, which no other sees."""
+    """Scan the installed packages anew, for a test that installs some, which no other sees."""
     from table_io.config.plugins import list_entry_points
 
     list_entry_points.cache_clear()

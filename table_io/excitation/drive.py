@@ -306,6 +306,12 @@ class Drive:
     def _starts(self) -> list[int]:
         return [segment.start for segment in self.segments]
 
+    @cached_property
+    def _last_overlaps(
+        self,
+    ) -> dict[tuple[int, int], list[tuple[Segment | HistorySegment, slice, Float1D]]]:
+        return {}
+
     @property
     def sine_segments(self) -> tuple[Segment, ...]:
         """Segments of the loop check and of a stepped sine."""
@@ -417,9 +423,14 @@ class Drive:
     def _overlaps(
         self, first: int, count: int
     ) -> list[tuple[Segment | HistorySegment, slice, Float1D]]:
-        """List (segment, window in the requested samples, segment fractions) of each overlap."""
+        """List (segment, window in the requested samples, segment fractions) of each overlap.
+
+        Those of the last request are kept: command, phase, level and labels follow one another.
+        """
+        if (kept := self._last_overlaps.get((first, count))) is not None:
+            return kept
         last = first + count
-        overlaps = []
+        overlaps: list[tuple[Segment | HistorySegment, slice, Float1D]] = []
         first_segment = max(bisect_right(self._starts, first) - 1, 0)
         for segment in self.segments[first_segment:]:
             if segment.start >= last:
@@ -428,4 +439,6 @@ class Drive:
             if lo < hi:
                 x = (np.arange(lo, hi) - segment.start) / segment.count
                 overlaps.append((segment, slice(lo - first, hi - first), x))
+        self._last_overlaps.clear()
+        self._last_overlaps[first, count] = overlaps
         return overlaps

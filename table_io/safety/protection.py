@@ -348,6 +348,8 @@ def _check_record(
 
     `values` (channel, history + sample); of three samples the median counts, as in other limits.
     """
+    if not state.record_limit.size:
+        return state, []
     played = np.flatnonzero(block.is_history)
     first, state = (
         state.record_samples,

@@ -394,7 +394,9 @@ def answer_block(
         state = apply_feedback(state, block, earliest)
     if state.stage.kind in ("open", "end"):  # nothing is evaluated; a hold may last for an hour
         return replace(state, blocks=(), records=()), state.records
-    blocks = tuple(kept_block for kept_block in state.blocks if kept_block.end > state.stage.first)
+    blocks = state.blocks
+    while blocks and blocks[0].end <= state.stage.first:
+        blocks = blocks[1:]
     return replace(state, blocks=blocks, records=()), state.records
 
 

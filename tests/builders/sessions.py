@@ -28,6 +28,7 @@ from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.rigs import RIG
 
 AT_RANGE_SHARE = 0.999  # of the range of a sensor: at it
+COARSE_BLOCK = 200  # samples
 T = TypeVar("T")
 
 
@@ -157,7 +158,7 @@ def play_guarded(
     It ends at the first finding that is known after sample `stop_after`.
     """
     drive = plan_sweep(profile)
-    rate, block = drive.rate_hz, profile.acquisition.block_samples
+    rate = drive.rate_hz
     backend = SimulatedBackend(rig, profile.specimen, rate, ManualClock())
     backend.open()
     volts = backend.tare(int(rate))
@@ -170,6 +171,9 @@ def play_guarded(
     backend.start()
     played = GuardedDrive()
     while played.samples < drive.rest_start + round(0.3 * rate):
+        # What is found does not depend on the blocks; when it is known does.
+        is_timed = stop_after is not None and played.samples + COARSE_BLOCK > stop_after
+        block = profile.acquisition.block_samples if is_timed else COARSE_BLOCK
         volts, first = backend.read(block), played.samples
         values = volts_to_si(volts, rig.sensors, tare)
         acquired = Block("meas", first, rate, rig.channels, values, *drive.labels(first, block))

@@ -32,6 +32,8 @@ from twin.model.model import EffectInstance, Model
 from twin.model.prepare import prepare_solver
 from twin.model.solver import StateEstimate
 
+pytestmark = pytest.mark.usefixtures("forget_entry_points")
+
 KICK = noisy(1.0)
 
 

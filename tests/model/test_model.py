@@ -26,6 +26,8 @@ from twin.model.model import Model, SensorModel
 from twin.model.prepare import prepare_solver
 from twin.model.solver import StateEstimate
 
+pytestmark = pytest.mark.usefixtures("forget_entry_points")
+
 G4 = Specimen(mass_kg=550.0, gap_mm=4.0)
 
 

@@ -42,6 +42,8 @@ from twin.studies.maps.task import MapOptions
 from twin.system import grid
 from twin.system.process_pool import TaskResult
 
+pytestmark = pytest.mark.usefixtures("forget_entry_points")
+
 PROGRAM = [sys.executable, "-c", "from twin.cli.entry import main; main()"]
 
 

@@ -29,6 +29,8 @@ from twin.studies import figures
 from twin.studies.batch import parse_gaps_mm
 from twin.studies.result import COLUMNS, SweepSummary, read_batch_rows
 
+pytestmark = pytest.mark.usefixtures("forget_entry_points")
+
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 TEST = """
 title = "Through the resonance"

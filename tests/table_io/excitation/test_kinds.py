@@ -27,6 +27,8 @@ from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from tests.builders.rigs import RIG
 from tests.table_io.excitation.pulse_train import PulseTrain
 
+pytestmark = pytest.mark.usefixtures("forget_entry_points")
+
 ORBITS = Path(__file__).parents[1] / "acquisition" / "unstable_orbits.json"
 SWEEP = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 3, "measured_cycles": 1}
 HELD_ORBITS = {

@@ -103,7 +103,7 @@ def list_findings(
     test: Profile = TEST,
     drive: Drive = PLAN,
     at_range: Change | None = None,
-    cut: int = 100,
+    cut: int = 5000,
     scale: float = 1.0,
     lag: int = 0,
     known: FrequencyResponse | None = None,
