@@ -14,24 +14,29 @@ from twin.model.parameters import Parameters
 
 START = Model(Parameters(550.0, 36e3, 1100.0, 500e3, 900.0, 500e3, 900.0, 4e-3, 4e-3))
 # Always in contact the damping of the bumpers and the lags of the readings look alike; in free
-# flight the mass still moves where the drive, and the record, has ended.
+# flight the mass still moves where the drive, and the record, has ended. The error of a laser that
+# is not linear shows where the motion is largest: without those steps, only noise would hold it.
 CASES = {
-    "mass_acc_m_s2": (10.0, StepTest(1.6, 3.2, 0.8, 6)),
-    "table_acc_m_s2": (-1.0, StepTest(2.0, 8.0, 2.0, 10)),
+    ("mass_acc_m_s2", 10.0): StepTest(1.6, 3.2, 0.8, 6),
+    ("mass_acc_m_s2", 40.0): StepTest(),
+    ("table_acc_m_s2", -1.0): StepTest(2.0, 8.0, 2.0, 10),
 }
 
 
-@pytest.mark.parametrize("missing", CASES)
-def test_a_missing_accelerometer_biases_no_parameter(missing: str, tmp_path: Path) -> None:
-    gap_mm, test = CASES[missing]
+@pytest.mark.parametrize(("missing", "gap_mm"), CASES)
+def test_a_missing_accelerometer_biases_no_parameter(
+    missing: str, gap_mm: float, tmp_path: Path
+) -> None:
+    test = CASES[missing, gap_mm]
     specimen = Specimen(gap_mm=gap_mm)
-    columns = record(specimen, Instruments(missing=(missing,)), 5, test)
+    columns = record(specimen, Instruments(missing=(missing,)), 7, test)
     log = import_columns(columns, tmp_path, format_profile(specimen, test))
     logs, _ = load_logs([log])
     prepared = prepare_problem(logs, START)
     problem = prepared.problem
     fit = widen_intervals(prepared.first_fit, problem.log_residuals)
     assert fit.cost < 1.2 * problem.expected_square
+    assert problem.fit_effects(prepared.parameters, ()).cost < 1.2 * problem.expected_square
     truth = {
         "stiffness": specimen.k, "damping": specimen.c, "bumper_stiffness_r": specimen.kb,
         "bumper_damping_r": specimen.cb,
@@ -41,7 +46,7 @@ def test_a_missing_accelerometer_biases_no_parameter(missing: str, tmp_path: Pat
         true = next((truth[name] for name in names if name in truth), None)
         if true is not None:
             assert abs(fit.values[free.key] - true) < 3.0 * fit.std_errors[free.key], free.name
-            assert fit.std_errors[free.key] < 0.05 * true, free.name
+            assert fit.std_errors[free.key] < 0.1 * true, free.name
     for nuisance, size in list_sizes(problem.log_residuals[0], fit.parameters):
         if nuisance.kind == "lag":
             assert abs(size * nuisance.size) < 4e-4, nuisance

@@ -38,7 +38,7 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.discovery.signals import SENSOR_PAIRS, LogSignals
-from twin.discovery.spectra import Spectrum
+from twin.compare.spectra import Spectrum
 from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
@@ -273,18 +273,24 @@ def _add_typical_noise(signals: LogSignals) -> LogSignals:
 
 
 def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSignals:
-    """Return the signals without the noise of forces and accelerations, for slopes.
+    """Return the signals without their noise, for slopes.
 
     Readings of their own would be regressors with errors: where the bumpers always touch, a force
     differs from K_j u + C_j u' by its noise alone, and its gain would be the one that explains this
-    noise. So forces and accelerations are those of the model and of the displacements, where these
-    exceed their noise: a resonance of a mounting grows with the square of the frequency.
+    noise. So forces and accelerations are those of the model and of the displacements, and these
+    are there where they exceed their noise: a resonance of a mounting grows with the square of the
+    frequency, as does what a laser adds to an acceleration.
     """
     signals, m = residuals.signals, residuals.motion()
     spectra, grid = dict(signals.spectra), signals.grid
     model = parameters.model_for_log(residuals.log_number, m)
-    gain = _pass_motion(signals, m.u)
+    gain = _pass_motion(signals, m.u, signals.motion_density)
     u, v = grid.apply_gain(m.u, gain), grid.apply_gain(m.v, gain)
+    for laser in spectra.keys() & {*LASERS}:
+        density = signals.noise[laser] / math.sqrt(grid.decimation)
+        spectra[laser] = spectra[laser] * _pass_motion(
+            signals, grid.to_time_domain(spectra[laser]), density
+        )
     forces = forces_along(model, u, v, m.table_acc, m.time_s, residuals.contact_state)
     damper, right, left = (grid.from_time_domain(np.nan_to_num(force)) for force in forces)
     if "damper_force_n" in spectra:
@@ -303,17 +309,26 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
         spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
     if {"table_acc_m_s2", "table_disp_m"} <= spectra.keys():
-        spectra["table_acc_m_s2"] = square * signals.fuse_body("table")
+        laser, acc = (signals.noise[name] for name in ("table_disp_m", "table_acc_m_s2"))
+        density = laser * acc / np.hypot(acc, square * laser) / math.sqrt(grid.decimation)
+        table = signals.fuse_body("table")
+        gain = _pass_motion(signals, grid.to_time_domain(table), density)
+        spectra["table_acc_m_s2"] = square * table * gain
     return replace(signals, spectra=spectra)
 
 
-def _pass_motion(signals: LogSignals, u: Float1D) -> Float1D:
-    """Return the gain of a Wiener filter of a displacement u in m (sample,), (frequency,)."""
+def _pass_motion(signals: LogSignals, u: Float1D, density: Float1D) -> Float1D:
+    """Return the gain of a Wiener filter, (frequency,), of a displacement u in m, (sample,).
+
+    `density` is that of its noise, (frequency,), at the rate of u.
+    """
     hz = signals.omega / (2.0 * np.pi)
-    power = np.abs(signals.grid.from_time_domain(u) / signals.grid.decimation) ** 2 / u.size
+    window = np.hanning(u.size)  # the step at an open end has power at all frequencies
+    spectrum = signals.grid.from_time_domain(window * u) / signals.grid.decimation
+    power = np.abs(spectrum) ** 2 / float(window @ window)
     power = uniform_filter1d(power, max(round(WIENER_BAND_HZ / hz[1]), MIN_WIENER_LINES))
     # noise alone exceeds its mean in a band by chance
-    noise = 2.0 * signals.motion_density**2
+    noise = 2.0 * density**2
     return np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
 
 
