@@ -76,6 +76,21 @@ def test_found_steps_are_the_driven_ones(name: str, channel: str, noise: float) 
     assert np.median(off) < 0.05 + 2 * noise
 
 
+@pytest.mark.parametrize("beat_hz", [0.0, 0.3])
+def test_the_hum_of_a_sensor_at_rest_is_no_step(beat_hz: float) -> None:
+    """Lines of the mains may beat, so that the quietest part of the rest is quieter than others."""
+    profile = case("fine")
+    x = np.concatenate([np.zeros(2000), motion(profile, "disp")])
+    time = np.arange(x.size) / 1000
+    beat = 1.0 + 0.5 * np.sin(2 * np.pi * beat_hz * time)
+    hum = beat * np.sin(2 * np.pi * 50.0 * time)
+    noise = 0.3 * np.random.default_rng(3).standard_normal(x.size)
+    x += 0.01 * np.abs(x).max() * (hum + noise)
+    detected = find_steps(x, 1000.0, profile.sweep)
+    assert detected.steps == profile.sweep.steps
+    assert np.mean(detected.label[:2000] == Label.REST) > 0.9
+
+
 def test_cycles_are_numbered_and_the_last_are_measured() -> None:
     profile = case("fine")
     detected = find_steps(motion(profile, "disp"), 1000.0, profile.sweep)

@@ -16,6 +16,7 @@ import numpy as np
 from table_io.block import Float1D, Int1D, Label
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import Step
+from twin.compare.hum import subtract_hum
 from twin.compare.phase_segments import (
     PhaseLine,
     find_straight_lines,
@@ -68,6 +69,8 @@ def find_steps(
     to those of the sweep, and the last `cycles` of a hold are its held cycles; otherwise only the
     number of measured cycles is taken from the sweep.
     """
+    # else the hum of a sensor is a sine at rest
+    signal = subtract_hum(signal, rate_hz)
     moving = ~detect_rest(signal, rate_hz)
     holds: list[Hold] = []
     for burst, track in enumerate(track_sines(signal, moving, rate_hz)):

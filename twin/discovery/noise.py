@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import spectrogram, welch
 
 from table_io.block import Bool2D, Float1D
-from twin.discovery.hum import separate_hum
+from twin.compare.hum import separate_hum
 
 MIN_REST_SAMPLES = 100
 SEGMENT_SAMPLES = 256  # of a spectrum; 50 % overlap

@@ -20,7 +20,7 @@ from twin.discovery.parameters import GapKey, NuisanceKey
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import MAX_EXPLAINED_COST
 from twin.discovery.signals import CELL_PAIRS, OPEN_END_S, SENSOR_PAIRS, LogSignals
-from twin.discovery.spectra import Spectrum
+from twin.compare.spectra import Spectrum
 
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
 # Limits of healthy instruments; see `table_io.sim.imperfections` for sizes in laboratories.

@@ -13,7 +13,7 @@ import numpy as np
 from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
-from twin.discovery.hum import remove_hum
+from twin.compare.hum import remove_hum
 from twin.discovery.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
 from twin.discovery.noise import (
     RestNoise,
@@ -22,7 +22,7 @@ from twin.discovery.noise import (
     find_loudest_power,
     measure_rest_noise,
 )
-from twin.discovery.spectra import (
+from twin.compare.spectra import (
     FrequencyGrid,
     Spectrum,
     exclude_margins,

@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
-from scipy.fft import ifft, ifftshift, next_fast_len, rfft, rfftfreq
+from scipy.fft import ifft, ifftshift, irfft, next_fast_len, rfft, rfftfreq
 from scipy.ndimage import binary_dilation
 
-from table_io.block import Bool2D, Float1D, Float2D
-from twin.discovery.spectra import FrequencyGrid, Spectrum
+from table_io.block import Bool2D, Float1D, Float2D, interpolate_missing
+from twin.compare.spectra import FrequencyGrid, Spectrum
 
 MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
 MIN_REST_S = 0.5  # a shorter rest is not used
@@ -24,6 +24,7 @@ SURROUNDINGS_HZ = 5.0
 MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
 LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a line over time
 SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
+BEAT_HZ = 1.0  # machines with different slip
 FILTER_WIDTHS = 4.0  # half width of that filter, in standard deviations
 MAX_EXCESS = 3.0  # times the amplitude at rest: above it there is a harmonic of the drive
 FREQUENCY_STEP_HZ = 0.1  # at most, between the values of a transform that measures a line
@@ -67,6 +68,25 @@ def remove_hum(
             limits = np.where(is_hum, MAX_EXCESS * amplitudes, np.inf)
             cleaned = _remove_line(cleaned, grid, line_hz, limits)
     return cleaned
+
+
+def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
+    """Return a record with an unknown rest, (sample,), less the hum that lasts throughout it.
+
+    With all near its lines, as hum may beat. What is most of the record is the motion, no hum.
+    """
+    known = interpolate_missing(values)
+    spectrum, hz = rfft(known - known.mean()), rfftfreq(known.size, 1.0 / rate_hz)
+    parts = [_measure_lines(part[None], rate_hz) for part in np.array_split(known, PART_COUNT)]
+    is_hum = np.zeros(hz.size, dtype=bool)
+    for in_parts in zip(*parts, strict=True):
+        if all(line.stands_out[0] for line in in_parts):
+            line_hz = float(np.median([line.frequency_hz for line in in_parts]))
+            is_hum |= np.abs(hz - line_hz) < BEAT_HZ
+    power = np.abs(spectrum) ** 2
+    if power[is_hum].sum() > 0.5 * power.sum():
+        return values
+    return values - irfft(np.where(is_hum, spectrum, 0.0), known.size)
 
 
 def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from table_io.block import Bool2D, Float1D
-from twin.discovery.hum import remove_hum
-from twin.discovery.spectra import FrequencyGrid
+from twin.compare.hum import remove_hum
+from twin.compare.spectra import FrequencyGrid
 
 RATE_HZ, DURATION_S, REST_S = 1000.0, 60.0, 4.0
 TIME_S: Float1D = np.arange(int(RATE_HZ * DURATION_S)) / RATE_HZ
