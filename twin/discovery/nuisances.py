@@ -26,6 +26,7 @@ from scipy.ndimage import uniform_filter1d
 
 from table_io.block import Bool2D, Float1D
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
+from twin.compare.spectra import Spectrum
 from twin.discovery.least_squares import FitResult, MapFunction
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
@@ -38,7 +39,6 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.discovery.signals import SENSOR_PAIRS, LogSignals
-from twin.compare.spectra import Spectrum
 from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")

@@ -14,6 +14,11 @@ from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.compare.hum import remove_hum
+from twin.compare.spectra import (
+    FrequencyGrid,
+    Spectrum,
+    exclude_margins,
+)
 from twin.discovery.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
 from twin.discovery.noise import (
     RestNoise,
@@ -21,11 +26,6 @@ from twin.discovery.noise import (
     estimate_noise_density,
     find_loudest_power,
     measure_rest_noise,
-)
-from twin.compare.spectra import (
-    FrequencyGrid,
-    Spectrum,
-    exclude_margins,
 )
 from twin.model.model import SensorModel
 
