@@ -309,8 +309,8 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
         spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
     if {"table_acc_m_s2", "table_disp_m"} <= spectra.keys():
-        laser, acc = (signals.noise[name] for name in ("table_disp_m", "table_acc_m_s2"))
-        density = laser * acc / np.hypot(acc, square * laser) / math.sqrt(grid.decimation)
+        disp, acc = (signals.noise[name] for name in ("table_disp_m", "table_acc_m_s2"))
+        density = disp * acc / np.hypot(acc, square * disp) / math.sqrt(grid.decimation)
         table = signals.fuse_body("table")
         gain = _pass_motion(signals, grid.to_time_domain(table), density)
         spectra["table_acc_m_s2"] = square * table * gain
