@@ -67,6 +67,11 @@ def jit_helper(*, inlined: bool = False) -> Callable[[F], F]:
     return decorator
 
 
+def jit_untyped_helper(function: Callable[..., Any]) -> Any:
+    """Mark a helper without type annotations, see `jit_helper`."""
+    return jit_helper()(function)
+
+
 def jit_helper_unless_none(argument: str, otherwise: Callable[..., Any]) -> Callable[[F], F]:
     """As an inlined `jit_helper`, but the function is `otherwise` where `argument` is None.
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
-from table_io.compilation import jit_helper, jit_untyped_kernel
+from table_io.compilation import jit_untyped_helper, jit_untyped_kernel
 from table_io.safety.thresholds import Thresholds
 
 # Codes of findings.
@@ -61,7 +61,7 @@ class CheckRun(NamedTuple):
     finding_count: Int1D
 
 
-@jit_helper()
+@jit_untyped_helper
 def _median(row, i):  # type: ignore[no-untyped-def]
     """Return the median of the samples i - 2 .. i; NaN if one of them is NaN."""
     a, b, c = row[i - 2], row[i - 1], row[i]
@@ -70,7 +70,7 @@ def _median(row, i):  # type: ignore[no-untyped-def]
     return max(min(a, b), min(max(a, b), c))
 
 
-@jit_helper()
+@jit_untyped_helper
 def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
     """Add a finding, once per episode."""
     last_index, count = run.state.last_true[code, channel], run.finding_count[0]
@@ -83,14 +83,14 @@ def _report(run, index, code, channel, value, limit):  # type: ignore[no-untyped
     run.finding_count[0] = count + 1
 
 
-@jit_helper()
+@jit_untyped_helper
 def _report_beyond(run, index, code, channel, value, limit):  # type: ignore[no-untyped-def]
     """Add a finding if a value exceeds its limit on either side."""
     if abs(value) > limit:
         _report(run, index, code, channel, value, limit)
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_delivery(values, clipped, i, index, repeated, run):  # type: ignore[no-untyped-def]
     """Detect samples at the sensor's range and lost samples; count repeated ones as lost."""
     limits, channels, dropped = run.limits, run.state.channels, True
@@ -113,7 +113,7 @@ def _check_delivery(values, clipped, i, index, repeated, run):  # type: ignore[n
             _report(run, index, BLIND, c, lost_s, limits.max_lost / limits.rate_hz)
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_stuck(values, i, index, command, demanded, run):  # type: ignore[no-untyped-def]
     """Detect stuck channels: runs of equal samples."""
     limits, channels = run.limits, run.state.channels
@@ -133,7 +133,7 @@ def _check_stuck(values, i, index, command, demanded, run):  # type: ignore[no-u
             _report(run, index, STUCK, c, length, min(limits.stuck_run[c], length))
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_silence(values, i, index, run):  # type: ignore[no-untyped-def]
     """Detect channels whose noise, from second differences, fell below that at rest."""
     limits, channels = run.limits, run.state.channels
@@ -159,7 +159,7 @@ def _check_silence(values, i, index, run):  # type: ignore[no-untyped-def]
             _report(run, index, SILENT, c, rms, math.sqrt(least_power / 6.0))
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_spikes(values, i, index, run):  # type: ignore[no-untyped-def]
     """Detect a spike at sample i - 1 in exactly one channel; real motion shows in others too."""
     row, deviation, spike_count = -1, 0.0, 0
@@ -171,7 +171,7 @@ def _check_spikes(values, i, index, run):  # type: ignore[no-untyped-def]
         _report(run, index - 1, SPIKE, row, deviation, run.limits.spike_limit[row])
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_limits(values, i, index, run):  # type: ignore[no-untyped-def]
     """Check stroke, velocity, acceleration and force of the table."""
     limits = run.limits
@@ -191,7 +191,7 @@ def _check_limits(values, i, index, run):  # type: ignore[no-untyped-def]
     _report_beyond(run, index, FORCE, acceleration_row, force, limits.force_n)
 
 
-@jit_helper()
+@jit_untyped_helper
 def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return True if the last samples repeat earlier ones in every noisy channel."""
     for distance in range(max(int(scalars[REPEAT_DISTANCE]), 1), limits.history):
@@ -212,7 +212,7 @@ def _is_repeated(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     return False
 
 
-@jit_helper()
+@jit_untyped_helper
 def _check_following(values, command, i, index, run):  # type: ignore[no-untyped-def]
     """Compare the command read back and the position of the table with the queued command."""
     limits, scalars, last_command = run.limits, run.state.scalars, command[i - 1]
@@ -242,7 +242,7 @@ def _check_following(values, command, i, index, run):  # type: ignore[no-untyped
         _report(run, index, FOLLOWING, limits.table_row, error, limit)
 
 
-@jit_helper()
+@jit_untyped_helper
 def _following_error(displacement, command, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the deviation of the table from the position that its command predicts, m.
 
@@ -260,7 +260,7 @@ def _following_error(displacement, command, i, limits, scalars):  # type: ignore
     return abs(displacement - scalars[TABLE_GAIN] * ((1.0 - fraction) * newer + fraction * older))
 
 
-@jit_helper()
+@jit_untyped_helper
 def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-def]
     """Return the possible table displacement caused by the specimen, m.
 
@@ -277,7 +277,7 @@ def _payload_deflection(values, i, limits, scalars):  # type: ignore[no-untyped-
     return ratio * scalars[PAYLOAD_PEAK] * (0.5 * scalars[TABLE_LAG]) ** 2
 
 
-@jit_helper()
+@jit_untyped_helper
 def _find_mark(command, phase, i, key, scalars, limits):  # type: ignore[no-untyped-def]
     """Return HALF_CYCLE if half a cycle is complete, NEW_MOTION if a motion begins, else 0.
 
