@@ -62,6 +62,8 @@ def draw_level(view: RunView, width: int, height: int) -> list[Text]:
     else:
         lines[1].append(f"{level.current_g:8.4f} g")
         lines[1].append(f"  {100 * level.deviation:+.2f} %", STYLES[level.tone])
+        if level.peak_g is not None:
+            lines[1].append(f"  peak {level.peak_g:.4f} g", DIM_STYLE)
     if level.correction is not None and level.thd is not None:
         lines[0].append(f"  command × {level.correction:.3f}", DIM_STYLE)
         outcome = "accepted" if level.accepted else "being tuned"

@@ -62,8 +62,8 @@ class RecentSamples:
         newest = [block.values for block in self.blocks if block.end > self.end - WINDOW_S * rate]
         return self.blocks[-1].channels, np.concatenate(newest, axis=1)
 
-    def table_level(self, frequency_hz: float) -> float | None:
-        """Return the fundamental amplitude of the table acceleration over whole cycles, in m/s2.
+    def table_level(self, frequency_hz: float) -> tuple[float, float] | None:
+        """Return (fundamental, peak) of the table acceleration over whole cycles, in m/s2.
 
         None if the step has not been held for one cycle yet.
         """
@@ -78,7 +78,8 @@ class RecentSamples:
         if not np.isfinite(acc[-count:]).all():
             return None
         rotation = np.exp(-2j * np.pi * np.arange(count) / cycle)
-        return float(2.0 * abs(acc[-count:] @ rotation) / count)
+        held = acc[-count:]
+        return float(2.0 * abs(held @ rotation) / count), float(np.abs(held).max())
 
     def twin_errors(self) -> dict[str, TwinErrors]:
         """Return (RMS, RMS error of restarted twin, of free twin) by channel, last second, SI."""

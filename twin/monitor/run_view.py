@@ -95,6 +95,7 @@ class Progress:
 class TableLevel:
     """Level of the table in g against demand, with its tolerance and the protection's bounds.
 
+    `current_g` is the fundamental, which is controlled, and `peak_g` the peak with all harmonics.
     `accepted`, `updates`, `correction` and `thd` are None before the step's first evaluation.
     """
 
@@ -105,6 +106,7 @@ class TableLevel:
     tolerance: float
     alarm: float | None
     abort_db: float | None
+    peak_g: float | None
     accepted: bool | None = None
     updates: int | None = None
     correction: float | None = None
@@ -235,7 +237,7 @@ class RunView:
         step, profile = self.run_state.step, self.run_state.profile
         if step is None:
             return None
-        current = self.run_state.recent.table_level(step.frequency_hz)
+        current, peak = self.run_state.recent.table_level(step.frequency_hz) or (None, None)
         demanded = step.acceleration_m_s2
         deviation = None if current is None else current / (demanded or math.nan) - 1.0
         tolerance = profile.control.tolerance if profile else DEFAULT_TOLERANCE
@@ -253,6 +255,7 @@ class RunView:
             tolerance,
             alarm,
             profile.protection.abort_db if profile else None,
+            None if peak is None else peak / GRAVITY_M_S2,
             *self._describe_evaluation(step.index),
         )
 

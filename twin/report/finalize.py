@@ -4,7 +4,7 @@ from pathlib import Path
 
 from twin.recording.reader import read_recording
 from twin.results.contracts import ReplayResult, RunSummary
-from twin.results.excitation_verdict import format_excitation_verdict
+from twin.results.excitation_verdict import describe_peaks, format_excitation_verdict
 from twin.results.rerun import restore_predictions
 from twin.results.summary import format_summary, summarise
 from twin.results.twin_verdict import format_twin_verdict
@@ -64,6 +64,8 @@ def print_twin_verdict(summary: RunSummary, folder: Path) -> None:
         return
     if excitation is not None:
         _print_coloured(format_excitation_verdict(excitation), excitation.verdict)
+        for sentence in describe_peaks(summary.steps):
+            print_line(f"  {sentence}")
     first, *lines = format_twin_verdict(verdict, folder)
     _print_coloured(first, verdict.verdict)
     for line in lines:

@@ -5,7 +5,9 @@ from collections.abc import Callable
 from rich.console import Console
 from rich.table import Table
 
+from table_io.units import GRAVITY_M_S2
 from twin.results.contracts import Response, RunSummary, StepEntry
+from twin.results.excitation_verdict import describe_peaks
 from twin.system.terminal import fits_width, print_table
 
 
@@ -27,8 +29,15 @@ COLUMNS: dict[str, Callable[[Response], str]] = {
         f"{_format_mean(response.impacts_right)}/{_format_mean(response.impacts_left)}"
     ),
 }
-ALL_COLUMNS = tuple(name for name in COLUMNS if name != "impacts R/L")
-COLUMN_SETS = (ALL_COLUMNS, ("eta_d", "eta_a", "impacts R/L"), ("eta_d", "impacts R/L"), ("eta_d",))
+LEVEL = "level, peak [g]"  # of the table: its fundamental, which is controlled, and its peak
+ALL_COLUMNS = (LEVEL, *(name for name in COLUMNS if name != "impacts R/L"))
+COLUMN_SETS = (
+    ALL_COLUMNS,
+    (LEVEL, "eta_d", "eta_a", "impacts R/L"),
+    (LEVEL, "eta_d", "impacts R/L"),
+    (LEVEL, "eta_d"),
+    ("eta_d",),
+)
 
 
 def print_prc(console: Console, summary: RunSummary) -> None:
@@ -41,7 +50,7 @@ def print_prc(console: Console, summary: RunSummary) -> None:
             "use --json or widen the terminal",
             highlight=False,
         )
-    for text in (*summary.findings, *_format_branches(summary)):
+    for text in (*summary.findings, *describe_peaks(summary.steps), *_format_branches(summary)):
         console.print(text, highlight=False, soft_wrap=True)
 
 
@@ -65,6 +74,9 @@ def _build_table(summary: RunSummary, names: tuple[str, ...]) -> Table:
 
 
 def _format_pair(step: StepEntry, name: str) -> str:
+    if name == LEVEL:
+        levels = (step.table_acc_fundamental_m_s2, step.table_acc_peak_m_s2)
+        return " | ".join(f"{level / GRAVITY_M_S2:.4f}" for level in levels).replace("nan", "-")
     cells = (
         COLUMNS[name](response or Response()).replace("nan", "-")
         for response in (step.measured, step.twin)

@@ -29,7 +29,7 @@ from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.reader import Recording, read_recording
 from twin.report.figures import draw_run_figures
 from twin.results.contracts import LevelResult, MeasuredFold, OrbitResult, RunSummary
-from twin.results.excitation_verdict import list_level_errors
+from twin.results.excitation_verdict import describe_peaks, list_level_errors
 from twin.results.report_data import (
     ReportData,
     build_report_data,
@@ -102,6 +102,7 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         motion_images=embed_images(motion_pictures),
         format_required=format_required,
         demand=demand,
+        peaks=describe_peaks(steps),
         level_errors={step.index: error for error, step in list_level_errors(steps)},
         texts=[
             (name, sha256(text.encode()).hexdigest(), _shorten(text))

@@ -36,7 +36,7 @@ from table_io.units import GRAVITY_M_S2
 from twin.system.terminal import console
 
 TABLE_HEADER = (
-    f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9}   "
+    f"{'step':>7}  {'direction':<9} {'f [Hz]':>7}  {'level [g]':>9} {'peak':>7}   "
     f"{'eta_d':>6} {'twin':>6}   {'impacts R/L':>11} {'twin':>7}   {'latency':>8}"
 )
 # 10 s at 2 kHz: a channel that is off its range is so in every cycle, also of a slow motion.
@@ -153,7 +153,8 @@ class RunProgress:
         latency = f"{self._latency_ms:5.2f} ms" if self._latency_ms is not None else "unpaced"
         self.print_line(
             f"{point.step + 1:>3}/{self._steps:<3}  {point.direction:<9} "
-            f"{point.frequency_hz:7.3f}  {point.table_acc_fundamental_m_s2 / GRAVITY_M_S2:9.4f}   "
+            f"{point.frequency_hz:7.3f}  {point.table_acc_fundamental_m_s2 / GRAVITY_M_S2:9.4f} "
+            f"{point.table_acc_peak_m_s2 / GRAVITY_M_S2:7.4f}   "
             f"{_format_eta(point.measured)} {_format_eta(point.twin)}   "
             f"{_format_impacts(point.measured):>11} {_format_impacts(point.twin):>7}   {latency:>8}"
         )

@@ -151,6 +151,7 @@ function drawLevel() {
   $("deviation").textContent = share === null ? (has ? "not steady yet" : "no step in progress") : signed(100 * share, "%");
   $("deviation").className = share === null ? "dim" : l.tone;
   $("level-note").textContent = !has ? "" : `demanded ${l.demanded_g.toFixed(4)} g`
+    + (known(l.peak_g) ? `, peak ${l.peak_g.toFixed(4)} g` : "")
     + (known(l.accepted) ? `, ${l.accepted ? "accepted" : "being tuned"}, corrected ${l.updates} ×` : "");
   drawLevelScale(has ? l : null, share);
 }
