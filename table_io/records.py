@@ -37,7 +37,7 @@ class RunStart:
     channels: tuple[str, ...]
     steps: tuple[Step, ...]
     planned_samples: int
-    tare: dict[str, float]  # SI value subtracted from each channel, taken before precompression
+    tare: dict[str, float]  # SI value subtracted from each channel, without preload
     versions: dict[str, str]
     host: str
     started_at: str  # ISO 8601, for display only

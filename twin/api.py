@@ -37,6 +37,7 @@ from twin.report.run_index import RunRow, index_runs
 from twin.rig.calibrate import CalibratedSensor, CalibrationOptions, calibrate
 from twin.rig.check import CheckedTest, check_test
 from twin.rig.check_table import WiringCheckResult, check_table
+from twin.rig.tare import TaredRig, TareOptions, tare
 from twin.simulation.task import simulate
 from twin.studies.maps.results import open_study
 from twin.studies.maps.task import MapOptions, StoredMap, compute_map
@@ -78,6 +79,8 @@ __all__ = [
     "TableDriveOptions",
     "TableTwinOptions",
     "TableTwinResult",
+    "TareOptions",
+    "TaredRig",
     "Verdict",
     "Verification",
     "WiringCheckResult",
@@ -107,6 +110,7 @@ __all__ = [
     "simulate",
     "simulate_gaps",
     "simulate_sweeps",
+    "tare",
     "verify",
     "write_folder_report",
 ]

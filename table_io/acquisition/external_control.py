@@ -43,9 +43,9 @@ from table_io.backends.follow import FollowWiring
 from table_io.block import Block, Bool2D, Float1D, Float2D, Int1D, join_blocks
 from table_io.clock import Clock, local_datetime
 from table_io.config.calibration import (
-    compute_tare,
     find_overdue_calibrations,
     measure_noise,
+    resolve_tare,
     volts_to_si,
 )
 from table_io.config.profile import Profile
@@ -250,7 +250,10 @@ class _ExternalSession:
         volts = self.source.tare(int(TARE_S * self.rate_hz))
         self._protection = PassiveProtection(self.setup, volts)
         rig = self.setup.rig
-        self._tare = compute_tare(volts, rig.sensors) | rig.stated_offsets
+        tare = resolve_tare(volts, rig, self.setup.profile.specimen.gaps_m)
+        self._tare = tare.offsets
+        if tare.note:
+            self.event_log.add_event("tare", tare.note)
         sensor = self.setup.rig.sensors[self._command_row]
         refuse_motion(self._command_m(volts), sensor, self.drive, self.rate_hz)
         lsb, noise = (

@@ -16,9 +16,9 @@ from table_io.backends import Backend, MachineLost
 from table_io.block import Block, Bool2D, find_stretches
 from table_io.clock import Clock, ManualClock, local_datetime
 from table_io.config.calibration import (
-    compute_tare,
     find_overdue_calibrations,
     measure_noise,
+    resolve_tare,
     volts_to_si,
 )
 from table_io.config.profile import Profile
@@ -26,6 +26,7 @@ from table_io.config.rig import RigConfig
 from table_io.records import Event, FrequencyResponse, Record, RunStart, RunStop, SampleGap, Trip
 from table_io.safety import protection
 from table_io.safety.findings import Finding
+from table_io.safety.loop_check_data import PreloadLimits
 from table_io.sequencer import procedure
 from table_io.sequencer.state import SequencerState
 
@@ -72,10 +73,14 @@ CLIP_RATIO = 0.999  # of a sensor's range; a sample at or above it is clipped
 
 @dataclass(frozen=True, slots=True)
 class SessionSetup:
-    """Profile and rig config of a session."""
+    """Profile and rig config of a session.
+
+    `preload_n`: allowed force (low, high) on the bumpers (right, left) at rest; None: not known.
+    """
 
     profile: Profile
     rig: RigConfig
+    preload_n: PreloadLimits | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,11 +209,18 @@ class _Session:
         volts = backend.tare(int(TARE_S * self.rate_hz))
         noise = measure_noise(volts, sensors)
         self._protection = protection.start_protection(self.setup.profile, self.setup.rig, noise)
-        self._state = replace(self._state, noise={name: rms for name, (rms, _) in noise.items()})
+        self._state = replace(
+            self._state,
+            noise={name: rms for name, (rms, _) in noise.items()},
+            preload_n=self.setup.preload_n,
+        )
         if self._state.stage.kind != "check":
             self.event_log.enter_state("armed")
         self.output_queue.start()
-        return compute_tare(volts, sensors) | self.setup.rig.stated_offsets
+        tare = resolve_tare(volts, self.setup.rig, self.setup.profile.specimen.gaps_m)
+        if tare.note:
+            self.event_log.add_event("tare", tare.note)
+        return tare.offsets
 
     def acquire(self, tare: dict[str, float], blocks: int = 1) -> Acquired:
         """Read and inspect the next blocks in SI: (block, clipped (channel, sample), findings)."""

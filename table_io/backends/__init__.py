@@ -12,8 +12,9 @@ and 6 repeated in any order; a call out of order raises RuntimeError.
 1. `open()` claims the machine for this client. It waits while the machine is still coming to rest
    from the previous connection, and moves nothing. Everything that the user must correct,
    including an unsupported sample rate, raises InputError with the remedy.
-2. `tare(samples)` returns input samples at rest, before bumpers are precompressed. It may be called
-   any number of times.
+2. `tare(samples)` returns input samples at rest, the specimen being as it is set up: bumpers that
+   press on the mass do so (a simulation may answer as if they were clear, and then its section has
+   `tares_without_bumpers`). It may be called any number of times.
 3. `queue(0, volts)` hands over the first command.
 4. `start()` starts output and inputs together, at once. Output sample i leaves when input sample i
    is taken, at scheduled_time_s(i) = scheduled_time_s(0) + i / rate_hz on the session's clock. The
@@ -120,7 +121,7 @@ class Backend(Protocol):
         """Claim the machine; nothing moves (clause 1)."""
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest, before precompression, (channel, sample) (clause 2)."""
+        """Return volts at rest, (channel, sample) (clause 2)."""
 
     def queue(self, index: int, volts: Float1D) -> None:
         """Replace the command from sample `index` on, volts (sample,) (clauses 3 and 6)."""
@@ -154,7 +155,7 @@ class AcquisitionSource(Protocol):
         """Connect to the device without changing its settings."""
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest, before precompression, (channel, sample)."""
+        """Return volts at rest, (channel, sample)."""
 
     def start(self) -> None:
         """Start acquisition: the next sample to arrive is sample 0."""

@@ -6,13 +6,20 @@ at rest, before precompression. Overdue calibrations never stop a test.
 
 import math
 from dataclasses import dataclass
-from datetime import date
+from datetime import date, datetime
 
 import numpy as np
 
 from table_io.block import Float1D, Float2D
+from table_io.clock import local_datetime
 from table_io.config.rig import OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
+from table_io.config.tare import (
+    MAX_TARE_AGE_H,
+    MAX_TARE_LEAD_H,
+    PRELOADED_CHANNELS,
+    TareRecord,
+)
 from table_io.errors import InputError
 
 
@@ -55,6 +62,77 @@ def measure_noise(
             edges = np.flatnonzero(np.diff(known, prepend=np.nan, append=np.nan))
             noise[sensor.channel] = (float(known.std()), int(np.diff(edges).max()))
     return noise
+
+
+@dataclass(frozen=True, slots=True)
+class ResolvedTare:
+    """Offset in SI of each channel of a run, and what an event says of their source ("": none)."""
+
+    offsets: dict[str, float]
+    note: str = ""
+
+
+def resolve_tare(volts: Float2D, rig: RigConfig, gaps_m: tuple[float, float]) -> ResolvedTare:
+    """Return the offsets of a run by volts at rest before it, (channel, sample).
+
+    Where bumpers may press on the mass, those that they change are taken from the rig's tare.
+    """
+    own = compute_tare(volts, rig.sensors) | rig.stated_offsets
+    if not needs_tare(rig, gaps_m) or rig.tare is None:
+        return ResolvedTare(own)
+    tare, drifts = rig.tare, []
+    stored = {}
+    for sensor in rig.sensors:
+        mean_v = tare.mean_v(sensor.channel)
+        if mean_v is None or sensor.channel in rig.stated_offsets or sensor.channel not in own:
+            continue
+        offset = mean_v / sensor.volts_per_si
+        if sensor.channel in PRELOADED_CHANNELS:
+            stored[sensor.channel] = offset
+        if sensor.channel == "table_disp_m" or sensor.channel not in PRELOADED_CHANNELS:
+            drift = (own[sensor.channel] - offset) / sensor.si_per_unit
+            drifts.append(f"{sensor.channel} {drift:+.3g} {sensor.unit}")
+    age_h = measure_tare_age(tare, local_datetime())
+    note = (
+        f"{', '.join(stored)} from the tare of {tare.at} with the bumpers clear, {age_h:.1f} h "
+        f"ago; since then the others have drifted by {', '.join(drifts)}"
+    )
+    return ResolvedTare(own | stored, note)
+
+
+def measure_tare_age(tare: TareRecord, time: datetime) -> float:
+    """Return the time in hours from a tare to `time`."""
+    return (time - datetime.fromisoformat(tare.at)).total_seconds() / 3600.0
+
+
+def needs_tare(rig: RigConfig, gaps_m: tuple[float, float]) -> bool:
+    """Return True if bumpers may press on the mass where a run tares its sensors."""
+    return min(gaps_m) <= 0.0 and not rig.tares_without_bumpers
+
+
+def check_tare(rig: RigConfig, gaps_m: tuple[float, float], where: object, time: datetime) -> None:
+    """Raise InputError if a run needs a tare with clear bumpers and the rig has no valid one."""
+    if not needs_tare(rig, gaps_m):
+        return
+    tare = rig.tare
+    needed = set(rig.channels).intersection(PRELOADED_CHANNELS) - rig.stated_offsets.keys()
+    problem = ""
+    if tare is None:
+        problem = "the rig has no tare with its bumpers clear"
+    elif missing := sorted(needed - set(tare.channels)):
+        problem = f"the tare of {tare.at} lacks {', '.join(missing)}"
+    elif not -MAX_TARE_LEAD_H <= (age_h := measure_tare_age(tare, time)) <= MAX_TARE_AGE_H:
+        problem = f"the tare of {tare.at} is {age_h:.0f} h old"
+    if problem:
+        raise InputError(
+            f"{problem}; at this gap the bumpers press on the mass, and a tare then would take "
+            "their preload for an offset",
+            where=where,
+            key="specimen.gap_mm",
+            value=round(1e3 * sum(gaps_m), 9),
+            allowed=f"a tare of this rig, at most {MAX_TARE_AGE_H:g} h old",
+            remedy="retract the bumpers and run `shaketwin tare --table RIG`",
+        )
 
 
 def find_overdue_calibrations(rig: RigConfig, today: date) -> list[str]:

@@ -29,10 +29,10 @@ class HashedFile(ConfigModel):
     def of_rig(cls, rig: RigConfig) -> "HashedFile":
         """Return name and hash of what a rig file means.
 
-        Comments, order, title and calibration records do not count; nor do keys at their default,
-        so that a new key of a later version changes no hash.
+        Comments, order, title, calibration records and tare do not count; nor do keys at their
+        default, so that a new key of a later version changes no hash.
         """
-        meaning = rig.model_dump(exclude={"title", "calibrations"}, exclude_defaults=True)
+        meaning = rig.model_dump(exclude={"title", "calibrations", "tare"}, exclude_defaults=True)
         text = json.dumps(meaning, sort_keys=True, default=str)
         return cls(name=rig.name, sha256=hashlib.sha256(text.encode()).hexdigest())
 

@@ -37,6 +37,7 @@ from table_io.config.sensor import (
     SensorConfig,
     check_sensor_unit,
 )
+from table_io.config.tare import TareRecord
 from table_io.errors import InputError, suggest
 
 BACKEND_GROUP = "shaketwin.backends"
@@ -58,6 +59,11 @@ class BackendConfig(ConfigModel):
     def warnings(self) -> list[str]:
         """Warnings of the pre-flight check about allowed but less safe settings."""
         return []
+
+    @property
+    def tares_without_bumpers(self) -> bool:
+        """True if a tare is that of clear bumpers also where they press: a simulation's truth."""
+        return False
 
     @property
     def max_start_wait_s(self) -> float:
@@ -242,6 +248,9 @@ class RigConfig(ConfigModel):
     calibrations: tuple[CalibrationRecord, ...] = Field(
         (), description="Records of `shaketwin calibrate`, appended when the file is read."
     )
+    tare: TareRecord | None = Field(
+        None, description="Newest record of `shaketwin tare`, appended when the file is read."
+    )
 
     @field_validator("extra_channels")
     @classmethod
@@ -378,6 +387,11 @@ class RigConfig(ConfigModel):
         """True if the rig file has the section of a simulated table, perhaps behind a protocol."""
         backends = map(load_backend, self.sections)
         return any(backend is not None and backend.is_simulated for backend in backends)
+
+    @property
+    def tares_without_bumpers(self) -> bool:
+        """True if the tare of a run is that of clear bumpers, whatever the gap."""
+        return any(section.tares_without_bumpers for section in self.sections.values())
 
     @property
     def channels(self) -> tuple[str, ...]:

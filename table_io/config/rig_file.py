@@ -10,6 +10,7 @@ from table_io.config.sensor import (
     CalibrationRecord,
     format_calibration_toml,
 )
+from table_io.config.tare import TareFile, TareRecord, format_tare_toml
 from table_io.errors import InputError
 
 
@@ -18,8 +19,13 @@ def calibrations_dir(path: Path) -> Path:
     return path.with_suffix(".calibrations")
 
 
+def tares_dir(path: Path) -> Path:
+    """Return the folder of the tares of a rig file."""
+    return path.with_suffix(".tares")
+
+
 def load_rig(path: Path) -> tuple[RigConfig, str]:
-    """Load (rig config, its text with the records appended).
+    """Load (rig config, its text with the calibration records and the newest tare appended).
 
     InputError names a faulty file, and a backend that is not installed.
     """
@@ -34,7 +40,16 @@ def load_rig(path: Path) -> tuple[RigConfig, str]:
             made_at, previous = _parse_time(record.at, file), newest.get(record.channel)
             if previous is None or made_at >= previous[0]:
                 newest[record.channel] = made_at, record
-    text = "\n".join([text, *(format_calibration_toml(record) for _, record in newest.values())])
+    texts = [text, *(format_calibration_toml(record) for _, record in newest.values())]
+    tares: list[tuple[datetime, TareRecord]] = []
+    for file in sorted(tares_dir(path).glob("*.toml")):
+        record_of_tare = load_config(file, TareFile, "tare")[0].tare
+        made_at = _parse_time(record_of_tare.at, file)
+        if record_of_tare.rig == rig.name:
+            tares.append((made_at, record_of_tare))
+    if tares:
+        texts.append(format_tare_toml(max(tares, key=lambda entry: entry[0])[1]))
+    text = "\n".join(texts)
     return parse_toml(text, RigConfig, str(path)), text
 
 

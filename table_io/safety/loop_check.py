@@ -34,7 +34,12 @@ from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import Check, FrequencyResponse
 from table_io.safety.consistency import MAX_CELL_OFFSET_RATIO, SENSOR_PAIRS
-from table_io.safety.loop_check_data import MAX_MISMATCH_RATIO, Complex1D, LoopCheckData
+from table_io.safety.loop_check_data import (
+    MAX_MISMATCH_RATIO,
+    Complex1D,
+    LoopCheckData,
+    PreloadLimits,
+)
 from table_io.units import GRAVITY_M_S2
 
 TABLE_CHANNELS = ("table_disp_m", "table_acc_m_s2")
@@ -309,6 +314,13 @@ def check_load_cells(data: LoopCheckData) -> Iterator[Check]:
         right, left = (abs(finite_mean(force)) for force in contact_forces(data.rest_before))
         asymmetry = (right - left) / (right + left)
         yield make_check(data, "preload, right over left", "force", asymmetry, *NO_LIMITS, "")
+    if data.has(*LOAD_CELLS) and data.preload_n is not None:
+        forces = contact_forces(data.rest_before)
+        for side, sign, force, limits in zip(
+            ("right", "left"), (1.0, -1.0), forces, data.preload_n, strict=True
+        ):
+            preload = sign * finite_mean(force)
+            yield make_check(data, f"preload of the {side} bumper", "force", preload, *limits, "N")
 
 
 def _check_noise_present(data: LoopCheckData, name: str) -> Iterator[Check]:
@@ -419,6 +431,8 @@ REMEDIES = {
     "swapped",
     "noise": "check for ground loops and the range, or raise the level of the excitation",
     "offset": "tare again with the table at rest and the bumpers unloaded",
+    "preload": "take a tare with the bumpers clear of the mass (shaketwin tare), else correct the "
+    "gap of the profile or the bumper stiffness of the model",
     "motion left": "let the servo come to rest, or raise loop_check.rest_s",
     "cross-talk": "check that the gap is as large as stated; if so, the cell responds to the "
     "motion of the table",
@@ -475,13 +489,14 @@ def evaluate(
     profile: Profile,
     rig: RigConfig,
     tare_noise: dict[str, float] | None = None,
+    preload_n: PreloadLimits | None = None,
 ) -> tuple[tuple[Check, ...], FrequencyResponse | None]:
     """Evaluate the loop check: return (checks, frequency response of the table).
 
     `block` holds the rest before, the motions and the rest after them, SI. Checks whose channels
     are missing are omitted. The response is None if the table's accelerometer is lost.
     """
-    data = LoopCheckData(block, drive, profile, rig, tare_noise or {})
+    data = LoopCheckData(block, drive, profile, rig, tare_noise or {}, preload_n)
     if not data.holds:
         return (), None
     checks = tuple(check for check_function in CHECK_FUNCTIONS for check in check_function(data))

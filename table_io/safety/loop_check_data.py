@@ -29,11 +29,16 @@ LOW_CUT_ITERATIONS = 4  # the equations are linear but for the square of the low
 MIN_LOW_CUT_RAD_S = 2 * math.pi * 0.02  # below it turns the phase by 2 degrees at 0.5 Hz
 
 
+# Allowed force (low, high) in N on the (right, left) bumper, compression positive.
+PreloadLimits = tuple[tuple[float, float], tuple[float, float]]
+
+
 @dataclass(frozen=True)
 class LoopCheckData:
     """Recorded loop check; `block` holds rest, motions and rest after them; SI, tared.
 
-    `tare_noise` is the rms of each channel during the tare, as far as known.
+    `tare_noise` is the rms of each channel during the tare, as far as known, and `preload_n` the
+    allowed force on the bumpers at rest.
     """
 
     block: Block
@@ -41,6 +46,7 @@ class LoopCheckData:
     profile: Profile
     rig: RigConfig
     tare_noise: dict[str, float]
+    preload_n: PreloadLimits | None = None
 
     @cached_property
     def holds(self) -> tuple[Segment, ...]:

@@ -154,7 +154,9 @@ def decide_after_check(state: SequencerState) -> SequencerState:
     """Start the excitation if the loop check passed, else end the test with a refusal."""
     plan, index = state.plan, state.stage.last
     block = join_blocks(state.blocks).cut(0, index)
-    checks, response = loop_check.evaluate(block, state.drive, plan.profile, plan.rig, state.noise)
+    checks, response = loop_check.evaluate(
+        block, state.drive, plan.profile, plan.rig, state.noise, state.preload_n
+    )
     records: list[Record] = [replace(check, index=index) for check in checks]
     failed = [check for check in checks if not check.passed]
     if response is not None:

@@ -14,6 +14,7 @@ from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory
 from table_io.records import OrbitPoint, Record, Step
+from table_io.safety.loop_check_data import PreloadLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +100,7 @@ class SequencerState:
     changed_from: int = 0
     refusal: str = ""  # reason why the run must not continue
     noise: dict[str, float] | None = None  # rms of each channel at the tare, SI
+    preload_n: PreloadLimits | None = None  # allowed force on the bumpers at rest
     blocks: tuple[Block, ...] = ()
     results: tuple[StepResult, ...] = ()
     search: OrbitSearch | None = None

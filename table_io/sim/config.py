@@ -222,6 +222,11 @@ class SimulatedTableConfig(BackendConfig):
     payload_reaction: bool = Field(
         True, description="Whether the force of the specimen moves the table."
     )
+    tares_as_set_up: bool = Field(
+        False,
+        description="Whether bumpers that press on the mass do so in a tare too, as on a real "
+        "table; else a tare answers as if they were clear.",
+    )
     seed: int = Field(0, description="Seed of the noise.")
     damper_stiffness_n_m: Positive = Field(description="True stiffness of the damper.")
     damper_damping_n_s_m: NonNegative = Field(description="True damping of the damper.")
@@ -259,6 +264,11 @@ class SimulatedTableConfig(BackendConfig):
         if sha256 is not None and info.data.get("hidden") is not None:
             raise InputError("[simulated.hidden] and truth are given", allowed="one of them")
         return sha256
+
+    @property
+    def tares_without_bumpers(self) -> bool:
+        """True if a tare is the truth of clear bumpers."""
+        return not self.tares_as_set_up
 
     def list_faults(self, rig: RigConfig) -> list[str]:
         """List channels without a simulated signal, and faults of channels without a sensor."""

@@ -234,6 +234,7 @@ class SimulatedBackend:
         self.replace_after = round(MIN_REPLACE_AHEAD_S * rate_hz)
         self._rig = rig
         self._clock = clock
+        self._tares_as_set_up = table.tares_as_set_up
         self._plant = build_plant(table, specimen, rate_hz)
         self._distortion: SensorDistortion | None = None
         self._imperfections: tuple[Imperfection, ...] = ()
@@ -271,10 +272,13 @@ class SimulatedBackend:
         self._is_open = True
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest before precompression, (channel, sample), just before sample 0."""
+        """Return volts at rest, (channel, sample), just before sample 0 (`tares_as_set_up`)."""
         self._require(self._is_open, "open() comes first")
         laboratory = self._build_laboratory(self._tare_laboratory_noise, -samples)
         signals = np.zeros((len(SIGNALS), samples))
+        if self._tares_as_set_up:
+            at_zero = np.zeros(self._plant.history_samples + samples)
+            self._plant.advance(self._plant.rest_state(), at_zero, signals)
         at_rest = laboratory.measure(self._true_values(np.zeros(samples), signals), signals)
         return self._digitizer.digitize(at_rest, self._tare_noise, laboratory)
 

@@ -40,6 +40,7 @@ TASKS = {
     "simulate": ("simulate",),
     "table-drive": ("compute_drive",),
     "table-twin": ("identify_table",),
+    "tare": ("tare",),
     "verify": ("verify", "repair_log"),
 }
 

@@ -149,7 +149,7 @@ def describe_set_up(gap_mm: float) -> str:
     if gap_mm == 0:
         return "Close the gap: both bumpers just touch the mass, without force on the load cells."
     return (
-        "Tare with the bumpers clear of the mass. Then precompress to "
+        "With the bumpers clear: shaketwin tare --table RIG. Then precompress to "
         f"{gap_mm:g} mm a total, {-gap_mm / 2:g} mm a side."
     )
 

@@ -14,6 +14,7 @@ from table_io.adaptive.policy import make_policy
 from table_io.clock import RealClock, local_datetime
 from table_io.config.base import ConfigModel
 from table_io.config.profile import Profile, ResumeConfig, SetUpConfirmation
+from table_io.config.rig_file import load_rig
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
@@ -32,7 +33,7 @@ from twin.setup.run_config import RunConfig, make_run_id
 from twin.system.files import hash_file, lock_file
 
 CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
-CALIBRATION_RECORDS = re.compile(r"^\[\[calibrations\]\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
+RIG_RECORDS = re.compile(r"^\[(?:\[calibrations\]|tare)\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
 LOCK_TIMEOUT_S = 20.0  # until the processes of a killed campaign have ended
 Status = Literal["planned", "running", "complete", "interrupted", "skipped"]
 LOG_NAME = "run.mcap"
@@ -153,7 +154,8 @@ def copy_configs(folder: Path, plan: CampaignPlan) -> None:
 def require_unchanged(folder: Path, plan: CampaignPlan) -> list[str]:
     """Raise InputError with the differences if the plan is not that of the folder; return warnings.
 
-    Calibration records added since the start change no measurement and give only a warning.
+    Calibration records and tares added since the start are those of new recordings and give only a
+    warning.
     """
     pairs = [(folder / CAMPAIGN_FILE, plan.text, str(plan.path))]
     for run in plan.runs:
@@ -169,8 +171,8 @@ def require_unchanged(folder: Path, plan: CampaignPlan) -> list[str]:
             continue
         if path.name == "rig.toml" and _without_records(before) == _without_records(text):
             notes.append(
-                f"{title}: the calibration records have changed since the campaign started; new "
-                "recordings carry the new ones"
+                f"{title}: calibration records or tares have changed since the campaign started; "
+                "new recordings carry the new ones"
             )
         else:
             changed += [f"  {title}:", *_diff_lines(before, text)]
@@ -189,8 +191,8 @@ def require_unchanged(folder: Path, plan: CampaignPlan) -> list[str]:
 
 
 def _without_records(text: str) -> str:
-    """Return the text of a rig config without its calibration records."""
-    return CALIBRATION_RECORDS.sub("", text).rstrip()
+    """Return the text of a rig config without its calibration records and tare."""
+    return RIG_RECORDS.sub("", text).rstrip()
 
 
 def _diff_lines(before: str, after: str) -> list[str]:
@@ -256,7 +258,7 @@ class ActiveCampaign:
             str(self.folder / name),
             endpoint,
             append_sections(bundle.profile_toml, sections),
-            bundle.rig_toml,
+            _read_newest_tare(bundle),
             bundle.model_toml,
         )
 
@@ -292,6 +294,18 @@ class ActiveCampaign:
         """Mark a run as skipped by the operator."""
         state = self.run_state(run)
         self.update_run(state, set_up=(*state.set_up, answer), status="skipped")
+
+
+def _read_newest_tare(bundle: RunConfig) -> str:
+    """Return the rig text of a run with the records that its file has by now.
+
+    A tare at the prompt before a run is used by that run. A rig file that was edited is not.
+    """
+    if bundle.rig_file is None or not bundle.rig_file.is_file():
+        return bundle.rig_toml
+    text = load_rig(bundle.rig_file)[1]
+    is_same = _without_records(text) == _without_records(bundle.rig_toml)
+    return text if is_same else bundle.rig_toml
 
 
 def append_sections(profile_toml: str, sections: dict[str, ConfigModel]) -> str:

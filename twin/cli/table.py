@@ -96,6 +96,7 @@ COMMANDS = (
     Command("compare", LOOK, "twin.inspection.cli:compare_command", computes=True),
     Command("guide", PLAN, "twin.guide.command:open_guide"),
     Command("check", PLAN, "twin.rig.cli:check_command", computes=True),
+    Command("tare", PLAN, "twin.rig.cli:tare_command"),
     Command("calibrate", PLAN, "twin.rig.cli:calibrate_command"),
     Command("devices", PLAN, "twin.rig.cli:devices_command"),
     Command("monitor", DRIVE, "twin.monitor.cli:monitor_command"),
@@ -139,6 +140,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "compare": ("compare runs/first runs/second", "compare runs/first last"),
     "guide": ("guide", "guide --out guide_pages"),
     "check": ("check quickstart", "check --table machine --unattended"),
+    "tare": ("tare --table my_table.toml", "tare --table my_table.toml --yes --temperature 21"),
     "calibrate": (
         "calibrate mass_acc_m_s2 --table my_table.toml --points 0,1",
         "calibrate force_r1_n --table my_table.toml --shunt"),

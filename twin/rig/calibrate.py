@@ -87,29 +87,40 @@ def calibrate(
             remedy=suggest(options.channel, rig.channels),
         )
     applied, prompts = _plan_points(options, sensor)
-    timestamp = f"{local_datetime():%Y%m%d-%H%M%S}"
-    if options.out is None and path.resolve().is_relative_to(PROFILES_DIR):
-        raise InputError(
-            "this rig file comes with shaketwin; records are kept next to a rig file of your own",
-            key="--table",
-            value=options.table,
-            remedy="make one with `shaketwin new rig FILE`, or name a file with --out",
-        )
-    record_path = options.out or calibrations_dir(path) / f"{timestamp}-{sensor.channel}.toml"
-    if record_path.exists():
-        raise InputError(
-            "exists; records are never overwritten",
-            where=record_path,
-            remedy="give the name of a new file with --out",
-        )
+    name = f"{local_datetime():%Y%m%d-%H%M%S}-{sensor.channel}"
+    record_path = choose_record_path(path, calibrations_dir(path), name, options.table, options.out)
     means = []
     for prompt in prompts:
         ask(prompt)
         means.append(_measure_mean(rig, sensor, prompt))
         tell(f"  {means[-1].volts:.6g} V +- {means[-1].sd:.2g} V")
     record = make_calibration(sensor, options, applied, tuple(means))
-    _write_record(record_path, record)
+    write_record(record_path, format_calibration_toml(record))
     return CalibratedSensor(record, record_path, sensor)
+
+
+def choose_record_path(
+    rig_path: Path, folder: Path, name: str, table: str, out: Path | None
+) -> Path:
+    """Return the file of a new record of a rig: `out`, or `name`.toml in a folder next to the rig.
+
+    InputError if it exists, or if the rig file is one that comes with shaketwin.
+    """
+    if out is None and rig_path.resolve().is_relative_to(PROFILES_DIR):
+        raise InputError(
+            "this rig file comes with shaketwin; records are kept next to a rig file of your own",
+            key="--table",
+            value=table,
+            remedy="make one with `shaketwin new rig FILE`, or name a file with --out",
+        )
+    record_path = out or folder / f"{name}.toml"
+    if record_path.exists():
+        raise InputError(
+            "exists; records are never overwritten",
+            where=record_path,
+            remedy="give the name of a new file with --out",
+        )
+    return record_path
 
 
 def print_calibration(options: CalibrationOptions, unattended: bool) -> int:
@@ -285,12 +296,12 @@ def make_calibration(
     )
 
 
-def _write_record(path: Path, record: CalibrationRecord) -> None:
-    """Write the record to a new file, creating its folder if needed."""
+def write_record(path: Path, text: str) -> None:
+    """Write the text of a record to a new file, creating its folder if needed."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("x", encoding="utf-8") as stream:
-            stream.write(format_calibration_toml(record))
+            stream.write(text)
     except OSError as error:
         raise InputError(
             f"cannot write: {error.strerror}", where=path, remedy="give another file with --out"

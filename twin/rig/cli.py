@@ -1,4 +1,4 @@
-"""Commands `table`, `check`, `calibrate` and `devices`: the machine and its sensors."""
+"""Commands `table`, `check`, `tare`, `calibrate` and `devices`: the machine and its sensors."""
 
 import sys
 from pathlib import Path
@@ -137,6 +137,30 @@ def calibrate_command(
 
     options = CalibrationOptions(channel, table, points, shunt, tolerance, applied_sd, out)
     raise typer.Exit(print_calibration(options, unattended))
+
+
+def tare_command(
+    table: Annotated[str, typer.Option("--table", help="Rig file or name.")],
+    yes: Annotated[
+        bool, typer.Option("--yes", help="The bumpers are clear of the mass: do not ask.")
+    ] = False,
+    temperature: Annotated[
+        float | None,
+        typer.Option("--temperature", metavar="C", help="Of the laboratory, into the record."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="New file for the record; default: next to the rig file."),
+    ] = None,
+) -> None:
+    """Tare all sensors with the bumpers clear of the mass; runs with G <= 0 need it.
+
+    Leaves a dated record next to the rig file; nothing is driven. A run with precompressed bumpers
+    takes the offsets of its load cells and displacements from the newest record.
+    """
+    from twin.rig.tare import TareOptions, print_tare
+
+    raise typer.Exit(print_tare(TareOptions(table, temperature, out), yes))
 
 
 def devices_command(

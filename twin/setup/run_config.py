@@ -2,7 +2,7 @@
 
 import platform
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ from table_io.acquisition.session import SessionSetup
 from table_io.backends import open_backend
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.calibration import check_tare
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
@@ -18,10 +19,12 @@ from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
+from table_io.safety.loop_check_data import PreloadLimits
 from table_io.safety.preflight import StepDemand, check_drive_rig, check_limits, compute_demands
 from table_io.sensor_errors import highpass
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
+from twin.model.contact_regime import U_L, U_R
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 from twin.recording.log_metadata import RECORDED_EVERY
@@ -31,6 +34,8 @@ from twin.system.versions import read_installed_versions
 if TYPE_CHECKING:
     from twin.compare.pipeline import PipelineSetup
 
+MAX_PRELOAD_ERROR = 0.5  # of K_j times the precompression: of a model that is not identified yet
+GAP_SETTING_M = 1e-4  # accuracy with which screws set a gap
 WARM_UP_ITEMS = 100  # of a session (1 s); every kernel is called within the first blocks
 
 
@@ -50,10 +55,33 @@ class RunConfig:
     profile_toml: str
     rig_toml: str
     model_toml: str
+    rig_file: Path | None = None  # of the rig, where the config was read from files
 
     @property
     def session_setup(self) -> SessionSetup:
-        return SessionSetup(self.profile, self.rig)
+        return SessionSetup(self.profile, self.rig, self.preload_n)
+
+    @property
+    def preload_n(self) -> PreloadLimits | None:
+        """Force (low, high) on the bumpers (right, left) that the model allows at rest; N.
+
+        The model need not be identified yet and a gap is set to 0.1 mm: a tare that has swallowed
+        a preload of 0.5 mm is far outside. None if no bumper is to press on the mass.
+        """
+        if min(self.profile.specimen.gaps_m) >= 0.0:
+            return None
+        from twin.model.closed_form import rest_state
+
+        p, state = self.parameters, rest_state(self.parameters)
+        right, left = (
+            (k * ((1.0 - MAX_PRELOAD_ERROR) * x - GAP_SETTING_M),
+             k * ((1.0 + MAX_PRELOAD_ERROR) * x + GAP_SETTING_M))
+            for k, x in (
+                (p.bumper_stiffness_r, float(state[U_R])),
+                (p.bumper_stiffness_l, -float(state[U_L])),
+            )
+        )  # fmt: skip
+        return right, left
 
     def prepare_twin(self, from_rest: bool = False) -> "PipelineSetup":
         """Return the twin's setup; the import compiles kernels that are not cached."""
@@ -204,6 +232,7 @@ def build_run_config(
             raise
         raise error.replace(remedy=f"{error.remedy}, or correct {model_path}") from None
     check_drive_rig(config.profile, config.rig, source)
+    check_tare(config.rig, config.profile.specimen.gaps_m, source, local_datetime())
     try:
         check_laws(config.model, config.profile)
     except InputError as error:
@@ -212,7 +241,7 @@ def build_run_config(
         check_limits(config.margins, config.profile, config.rig, source)
     except InputError as error:
         raise error.replace(remedy=f"its limits are those of {rig_path}") from None
-    return config
+    return replace(config, rig_file=rig_path)
 
 
 def read_model(

@@ -113,7 +113,7 @@ class MachineBackend:
             self._clock.wait_until(self._clock.now() + 0.1)
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest, before precompression, (channel, sample)."""
+        """Return volts at rest, (channel, sample)."""
         answer = self._request(MachineMessage(MessageKind.TARE, samples), MessageKind.TARED)
         return self._to_matrix(answer)
 

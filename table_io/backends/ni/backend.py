@@ -186,7 +186,7 @@ class NiBackend:
         self._send_heartbeat()
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest, before precompression, (channel, sample)."""
+        """Return volts at rest, (channel, sample)."""
         tasks = self._require_tasks()
 
         def read_volts() -> Float2D:

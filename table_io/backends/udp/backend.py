@@ -187,7 +187,7 @@ class UdpBackend:
             raise
 
     def tare(self, samples: int) -> Float2D:
-        """Return volts at rest, before precompression, (channel, sample), from now on."""
+        """Return volts at rest, (channel, sample), from now on."""
         self._require_link()
         self._require(not self._started, "start() was called already; tare before start()")
         self._buffer = ReceiveBuffer(len(self.channels), self._request(PacketKind.BEAT).taken)
