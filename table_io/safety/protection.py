@@ -22,7 +22,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.config.excitation import History, history_acceleration
@@ -336,6 +335,8 @@ def _limit_record(profile: Profile) -> Float1D:
     excitation, rate_hz = profile.excitation, profile.acquisition.rate_hz
     if not isinstance(excitation, History) or excitation.drive is None:
         return np.empty(0)
+    from scipy.ndimage import maximum_filter1d  # slow to import, and few tests have a drive
+
     size = np.abs(history_acceleration(profile.plan.target_m, rate_hz))
     envelope = maximum_filter1d(size, 2 * math.ceil(ENVELOPE_S * rate_hz) + 1)
     return MAX_RECORD_RATIO * np.maximum(envelope, MIN_ENVELOPE_RATIO * size.max())

@@ -58,7 +58,8 @@ enabled = false
 """
 AWAY = (
     "sensor_gain", "sensor_lag", "sensor_offset", "table_tilt", "bumper_maxwell", "hunt_crossley",
-    "mass_error", "maxwell_damper", "bouc_wen",
+    "mass_error", "maxwell_damper", "bouc_wen", "adhesion", "appendage", "dead_band", "gap_drift",
+    "position_damping", "stribeck_friction",
 )  # fmt: skip
 WITHOUT = (*AWAY, "bumper_hardening", "bumper_cubic")
 VERDICTS = ("none", "named", "ambiguous", "unexplained")

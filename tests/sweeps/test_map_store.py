@@ -4,6 +4,7 @@ import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -61,11 +62,8 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_any_number_of_processes_stores_the_same_bytes(
-    whole_study: Path, tmp_path: Path, workers: int
-) -> None:
-    result = call_main("map", whole_study / "study.toml", "--out", tmp_path, "--workers", workers)
+def test_two_processes_store_the_same_bytes(whole_study: Path, tmp_path: Path) -> None:
+    result = call_main("map", whole_study / "study.toml", "--out", tmp_path, "--workers", 2)
     assert result.returncode == 0, result.stderr
     assert read_stored_bytes(tmp_path) == read_stored_bytes(whole_study / "out")
 
@@ -146,7 +144,7 @@ def test_a_chunk_that_was_lost_after_all_is_computed_again(
 ) -> None:
     """Its line is on the disk, but a file of it is gone, another cut and a third other numbers."""
     out = tmp_path / "out"
-    make_stored_study(whole_study / "study.toml", out, range(5))
+    shutil.copytree(whole_study / "out", out)
     arrays = out / "results.zarr"
     (arrays / "peak_disp_m" / "c" / "0").unlink()
     cut = arrays / "eta_d" / "c" / "1" / "0" / "0"
@@ -325,7 +323,7 @@ def test_what_zarr_leaves_behind_is_removed_and_nothing_else(
     whole_study: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    make_stored_study(whole_study / "study.toml", out, range(5))
+    shutil.copytree(whole_study / "out", out)
     before = read_stored_bytes(out)
     (out / "results.zarr" / "eta_d" / "c" / "0.abc.partial").write_bytes(b"1")
     remove_partial_files(out)

@@ -26,7 +26,6 @@ from table_io.safety.preflight import (
     list_limits,
 )
 from table_io.units import GRAVITY_M_S2
-from twin.rig.drive_figure import draw_drive
 from twin.rig.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_response
 from twin.setup.disk import planned_bytes
 from twin.setup.folders import make_output_folder
@@ -77,6 +76,8 @@ def print_check(profile: Path, table: str | None, out: Path | None) -> None:
     print_plan(console, checked)
     if out is not None:
         folder = make_output_folder(out, make_run_id(checked.config.name))
+        from twin.rig.drive_figure import draw_drive  # loads what draws
+
         print_line(f"drive drawn: {draw_drive(checked.config, folder / 'drive.png')}")
 
 
