@@ -29,7 +29,7 @@ from tests.sweeps.small_study import (
 from tests.system.clusters import start_cluster, start_quietly
 from twin.api import open_study
 from twin.studies import DEFINITION_FILE, command
-from twin.studies.maps import task
+from twin.studies.maps import store, task
 from twin.studies.maps.compute import (
     compute_chunk,
     compute_outcomes,
@@ -256,10 +256,10 @@ def test_other_versions_are_refused(
     whole_study: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
-    make_stored_study(whole_study / "study.toml", out, range(1))
-    definition = json.loads((out / DEFINITION_FILE).read_text())
-    definition["versions"]["numpy"] = "0.1"
-    (out / DEFINITION_FILE).write_text(json.dumps(definition))
+    versions = store.read_study_versions() | {"numpy": "0.1"}
+    with monkeypatch.context() as context:
+        context.setattr(store, "read_study_versions", lambda: versions)
+        make_stored_study(whole_study / "study.toml", out, range(0))
     with raises_input_error(key="--resume", problem="numpy 0.1"):
         command.run_study(MapOptions(whole_study / "study.toml", out, 1, resume=True), False)
     assert "numpy 0.1" in str(compute_chunk(out, 1))

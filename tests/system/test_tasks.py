@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Generator, Iterator
@@ -147,6 +148,33 @@ def test_a_task_that_fails_on_a_cluster_is_a_failure_with_its_reason(scheduler: 
     assert all(result.value == number for number, result in by_number.items())
 
 
+def test_worker_of_a_cluster_that_gives_no_results_is_named_and_left_out(scheduler: str) -> None:
+    faulty: list[int] = []
+    lines: list[str] = []
+
+    def find_fault(process: int) -> str:
+        faulty[:] = faulty or [process]
+        return "it cannot write" if process in faulty else ""
+
+    results = run_tasks(
+        task_functions.return_process, range(8), Workers(0, scheduler),
+        find_fault=find_fault, tell=lines.append,
+    )  # fmt: skip
+    by_number = {result.number: result for result in results}
+    assert sorted(by_number) == [*range(8)]
+    assert all(not result.failure and result.value not in faulty for result in by_number.values())
+    (line,) = lines
+    assert re.fullmatch(r"worker tcp://\S+ gets no more tasks: it cannot write", line)
+
+
+def test_cluster_without_a_worker_that_gives_results_has_failed(scheduler: str) -> None:
+    results = run_tasks(
+        task_functions.square, [1], Workers(0, scheduler), find_fault=lambda _: "it cannot write"
+    )
+    (result,) = results
+    assert re.fullmatch(r"it cannot write \(worker tcp://\S+\)", result.failure)
+
+
 def test_a_stop_ends_a_cluster_run(scheduler: str) -> None:
     numbers: list[int] = []
     for result in run_tasks(
@@ -181,7 +209,7 @@ def test_a_cluster_whose_workers_all_die_is_given_up(monkeypatch: pytest.MonkeyP
             list(results)
 
 
-def test_a_cluster_whose_scheduler_dies_is_given_up() -> None:
+def test_a_cluster_whose_scheduler_dies_is_given_up(capfd: pytest.CaptureFixture[str]) -> None:
     with ExitStack() as stack:
         helpers, address = start_cluster(stack)
         for helper in helpers:
@@ -191,6 +219,7 @@ def test_a_cluster_whose_scheduler_dies_is_given_up() -> None:
         helpers[0].kill()
         with raises_input_error(key="--scheduler", problem="no longer answers"):
             list(results)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_worker_of_another_version_is_refused(

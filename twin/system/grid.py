@@ -12,6 +12,7 @@ from twin.system.process_pool import (
     MAX_TASK_S,
     Task,
     Workers,
+    find_no_fault,
     find_no_problem,
     order_results,
     run_tasks,
@@ -51,17 +52,20 @@ def run_grid(
     is_ordered: bool = False,
     max_task_s: float = MAX_TASK_S,
     find_problem: Callable[[], str] = find_no_problem,
+    find_fault: Callable[[Any], str] = find_no_fault,
 ) -> None:
     """Compute the tasks of `numbers` until the watch says stop, and keep each result as it comes.
 
     `keep` stores what the task of a number returned, and returns how many of the `total` cases are
     in it; `done` of them are stored from an earlier start. `is_ordered`: the results are kept in
-    the order of 0, 1, ... Raises what `describe_failure` makes of a task without a result and why.
+    the order of 0, 1, ... `find_fault` returns why a result cannot be kept, "" if it can. Raises
+    what `describe_failure` makes of a task without a result and why.
     """
     watch.advance(unit, done, total)
     results = run_tasks(
         task, numbers, workers, watch.find_stop,
         max_task_s=max_task_s, attempts=MAX_ATTEMPTS, find_problem=find_problem,
+        find_fault=find_fault, tell=watch.tell,
     )  # fmt: skip
     for result in order_results(results) if is_ordered else results:
         if result.failure:

@@ -6,11 +6,12 @@ any number of workers gives the same results; what is large it writes to a file 
 for short tasks in kernels that release the GIL: they start at once and share what is compiled.
 """
 
+import logging
 import multiprocessing
 import os
 import signal
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from concurrent.futures import (
     FIRST_COMPLETED,
     CancelledError,
@@ -19,7 +20,7 @@ from concurrent.futures import (
     wait,
 )
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -36,6 +37,7 @@ MAX_TASK_S = 900.0  # time limit of a task in a local process, which is then ter
 CONNECT_TIMEOUT_S = 10.0
 POLL_S = 0.2  # period of polling `stop` and the connection
 MAX_IDLE_S = 60.0  # without any worker, which may come back
+ENGINE_LOGGERS = ("distributed", "distributed.client")
 TASKS_PER_THREAD = 2  # sent ahead, so that no thread waits for the next
 LOST_MESSAGE = "the Dask scheduler no longer answers; what is completed is kept"
 RESUME_REMEDY = "start scheduler and workers again, and resume"
@@ -48,6 +50,15 @@ Result = TypeVar("Result")
 def find_no_problem() -> str:
     """Accept every worker."""
     return ""
+
+
+def find_no_fault(_: Any) -> str:
+    """Accept every result."""
+    return ""
+
+
+def tell_nobody(_: str) -> None:
+    """Take a line that nobody asked for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,21 +121,32 @@ def run_tasks(
     max_task_s: float = MAX_TASK_S,
     attempts: int = 1,
     find_problem: Callable[[], str] = find_no_problem,
+    find_fault: Callable[[Any], str] = find_no_fault,
+    tell: Callable[[str], None] = tell_nobody,
 ) -> Iterator[TaskResult]:
     """Yield the result of the task of every number, in the order of completion.
 
     After `stop()` is true no task is started; those in progress are completed and yielded. A task
     whose process dies is started again until it has had `attempts`. Only a process has a
     `max_task_s`: a task that does not end on a cluster must be stopped by its operator, and what a
-    task raises in a thread is raised here. `find_problem` runs on every
-    worker of a cluster before anything starts and returns why it cannot be used, "" if it can.
+    task raises in a thread is raised here. `find_problem` runs on every worker of a cluster before
+    anything starts and returns why it cannot be used, "" if it can. `find_fault` returns why a
+    result is none: a worker of a cluster that gave it gets no more tasks, which `tell` is told, and
+    its task goes to another; without another the task has failed.
     InputError if the cluster cannot be used, or is lost.
     """
     if workers.scheduler:
-        return run_on_cluster(workers.scheduler, task, numbers, stop, attempts, find_problem)
+        return run_on_cluster(
+            workers.scheduler, task, numbers, stop, attempts, find_problem, find_fault, tell
+        )
     if workers.in_threads:
-        return _run_in_threads(task, numbers, workers.count, stop)
-    return _run_in_processes(task, numbers, workers.count, stop, max_task_s, attempts)
+        results = _run_in_threads(task, numbers, workers.count, stop)
+    else:
+        results = _run_in_processes(task, numbers, workers.count, stop, max_task_s, attempts)
+    return (
+        result if result.failure else replace(result, failure=find_fault(result.value))
+        for result in results
+    )
 
 
 def order_results(results: Iterable[TaskResult]) -> Iterator[TaskResult]:
@@ -271,19 +293,26 @@ def run_on_cluster(
     stop: StopFunction,
     attempts: int,
     find_problem: Callable[[], str],
+    find_fault: Callable[[Any], str],
+    tell: Callable[[str], None],
 ) -> Iterator[TaskResult]:
     """Yield results as `tasks.run_tasks` does, from the workers of a scheduler."""
     from distributed import wait
 
     with _connect(address) as client:
         _require_equal_workers(client, address, find_problem)
-        pending = iter(numbers)
+        pending, repeated = iter(numbers), deque[int]()
         window = TASKS_PER_THREAD * max(sum(client.nthreads().values()), 1)
         running: dict[Any, int] = {}
+        faulty: set[str] = set()  # workers
         watch = _WorkerWatch(client, address)
         while True:
-            for number in () if stop() else islice(pending, window - len(running)):
-                future = client.submit(task, number, pure=False, retries=attempts - 1)
+            following = _take_first(repeated, pending)
+            for number in () if stop() else islice(following, window - len(running)):
+                future = client.submit(
+                    _run_named, task, number, pure=False, retries=attempts - 1,
+                    workers=_list_others(client, faulty) if faulty else None,
+                )  # fmt: skip
                 running[future] = number
             if not running:
                 return
@@ -291,7 +320,39 @@ def run_on_cluster(
                 wait([*running], POLL_S, "FIRST_COMPLETED")
             watch.require_workers()
             for future in [future for future in running if future.done()]:
-                yield _read_result(future, running.pop(future), address)
+                result = _read_result(future, running.pop(future), address)
+                if result.failure:
+                    yield result
+                    continue
+                worker, value = result.value
+                fault = find_fault(value)
+                if fault and worker not in faulty:
+                    faulty.add(worker)
+                    tell(f"worker {worker} gets no more tasks: {fault}")
+                if fault and _list_others(client, faulty):
+                    repeated.append(result.number)
+                else:
+                    reason = f"{fault} (worker {worker})" if fault else ""
+                    yield TaskResult(result.number, value, reason)
+
+
+def _take_first(repeated: deque[int], pending: Iterator[int]) -> Iterator[int]:
+    """Yield the repeated numbers, which leave their queue, then the pending ones."""
+    while repeated:
+        yield repeated.popleft()
+    yield from pending
+
+
+def _list_others(client: Any, faulty: Container[str]) -> list[str]:
+    """Return the addresses of the workers that are not faulty."""
+    return [worker for worker in client.nthreads() if worker not in faulty]
+
+
+def _run_named(task: Task, number: int) -> tuple[str, Any]:
+    """Return the address of this worker of a cluster, and what the task returned."""
+    from distributed import get_worker
+
+    return get_worker().address, task(number)
 
 
 def require_cluster(address: str) -> None:
@@ -314,6 +375,8 @@ def _connect(address: str) -> Iterator[Any]:
     require_package("distributed", "cluster", f"--scheduler {address}")
     from distributed import Client
 
+    for name in ENGINE_LOGGERS:  # what they report is said by an error, without their tracebacks
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CONNECT_TIMEOUT_S, set_as_default=False)
     except (OSError, TimeoutError, ValueError, TypeError) as error:

@@ -16,6 +16,7 @@ from twin.studies.maps.outcomes import CaseChunk, Outcome, SweepPlan
 from twin.studies.maps.store import (
     StoredChunk,
     hash_arrays,
+    hash_stored,
     open_group,
     read_definition,
     read_study_versions,
@@ -111,12 +112,15 @@ def compute_chunk(folder: Path, number: int) -> StoredChunk | str:
         results, failures = compute_outcomes(study, values, arrays["seed"][span])
         for name, computed in results.items():
             arrays[name][span] = computed
+        sha256 = hash_arrays(results)
+        if hash_stored(arrays, results, span) != sha256:
+            return "what was stored reads back otherwise"
     except (InputError, OSError, MemoryError) as error:
         return str(error) or type(error).__name__
     return StoredChunk(
         chunk=number,
         first=first,
         cases=span.stop - first,
-        sha256=hash_arrays(results),
+        sha256=sha256,
         failures={first + index: reason for index, reason in sorted(failures.items())},
     )

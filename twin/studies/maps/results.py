@@ -15,7 +15,7 @@ from table_io.errors import InputError, require_package, suggest
 from twin.compare.curves import FloatND
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.sampling import grid_axes
-from twin.studies.maps.store import Manifest, open_group, read_definition
+from twin.studies.maps.store import Manifest, open_group, read_definition, require_unchanged_store
 from twin.studies.maps.study import Study
 
 if TYPE_CHECKING:
@@ -27,8 +27,9 @@ def open_study(folder: Path | str, variables: Sequence[str] | None = None) -> "x
 
     A grid has a dimension per parameter, named as its key, and `repeat` where cases are repeated;
     samples have the dimension `case`; curves also `direction` (1 forward, -1 backward) and
-    `frequency_hz`. Cases without a result, such as those still to come, are NaN. `variables`: only
-    these are read. InputError for a folder without a study, or an unknown variable.
+    `frequency_hz`. Cases without a result, such as those still to come, are NaN. `variables`:
+    only these are returned. InputError for a folder without a study, for one in which results,
+    parameters or seeds are not those that were stored, or an unknown variable.
     """
     require_package("xarray", "studies", "open_study")
     return StudyResults(Path(folder)).to_dataset(variables)
@@ -47,11 +48,15 @@ class StudyResults:
 
     @cached_property
     def manifest(self) -> Manifest:
-        return Manifest(self.folder)
+        return Manifest(self.folder, [variable.name for variable in self.study.variables])
 
     @cached_property
     def _group(self) -> Any:
-        return open_group(self.folder, "r")
+        """The arrays, of which every stored chunk is what was computed; else InputError."""
+        require_unchanged_store(self.folder, self.study, read_definition(self.folder))
+        group = open_group(self.folder, "r")
+        self.manifest.require_unchanged(group)
+        return group
 
     @property
     def scalars(self) -> tuple[OutcomeVariable, ...]:

@@ -31,6 +31,8 @@ from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study, StudyDefinition
 from twin.system.versions import find_version_problem, read_installed_versions
 
+COORDINATES = ("seed", "frequency_hz", "direction")  # besides the parameters
+READ_ERRORS = (OSError, ValueError, RuntimeError, KeyError, TypeError, AttributeError)  # of zarr
 RESULTS_FOLDER, MANIFEST_FILE = "results.zarr", "chunks.jsonl"
 COORDINATE_CHUNK = 100_000  # cases
 DIRECTION_VALUES = {"forward": 1, "backward": -1}
@@ -44,6 +46,7 @@ class StoredChunk(Contract):
     cases: int
     sha256: str
     failures: dict[int, str]
+    line_sha256: str = ""  # of the line itself, none in a study of an earlier version
 
     @property
     def span(self) -> slice:
@@ -86,8 +89,44 @@ def create_store(folder: Path, study: Study, sweep: SweepPlan, values: Float2D) 
             attributes={"units": variable.unit, "long_name": variable.title},
         )
     # Last: a folder with a definition has the whole group.
-    text = json.dumps(make_definition(study).to_plain(), indent=1, sort_keys=True)
+    definition = make_definition(study)
+    definition.store_sha256 = _hash_store(folder, open_group(folder, "r"), study)
+    definition.sha256 = _hash_contract(definition, "sha256")
+    text = json.dumps(definition.to_plain(), indent=1, sort_keys=True)
     replace_text(folder / DEFINITION_FILE, text)
+
+
+def _hash_store(folder: Path, group: Any, study: Study) -> str:
+    """Return a hash of the metadata of all arrays as written, and the values of the coordinates."""
+    store = folder / RESULTS_FOLDER
+    names = [*(parameter.name for parameter in study.config.parameters), *COORDINATES]
+    arrays = {
+        str(path.relative_to(store)): np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        for path in sorted(store.rglob("zarr.json"))
+    }
+    return hash_arrays(arrays | {name: group[name][:] for name in names})
+
+
+def _hash_contract(contract: Contract, key: str) -> str:
+    """Return a hash of all that a contract holds but `key`, where the hash stands."""
+    plain = {name: value for name, value in contract.to_plain().items() if name != key}
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def require_unchanged_store(folder: Path, study: Study, definition: StudyDefinition) -> None:
+    """Raise InputError where metadata or coordinates are not those with which a study began."""
+    if not definition.store_sha256:
+        return
+    try:
+        is_same = definition.store_sha256 == _hash_store(folder, open_group(folder, "r"), study)
+    except READ_ERRORS:
+        is_same = False
+    if not is_same:
+        raise InputError(
+            "its parameters, seeds or metadata are not those with which the study began",
+            where=folder / RESULTS_FOLDER,
+            remedy="restore it, or start a new study elsewhere",
+        )
 
 
 def _describe_study(study: Study) -> Mapping[str, object]:
@@ -145,21 +184,36 @@ def read_definition(folder: Path) -> StudyDefinition:
     """Read the definition of a study; InputError if the folder has none."""
     path = folder / DEFINITION_FILE
     try:
-        return StudyDefinition.model_validate_json(path.read_bytes(), extra="ignore")
+        definition = StudyDefinition.model_validate_json(path.read_bytes(), extra="ignore")
     except OSError:
         raise InputError(
             "no study", where=folder, allowed="a folder in which `shaketwin map` has started one"
         ) from None
     except ValidationError as error:
         raise _make_damage_error(path, error) from None
+    if not _is_sealed(definition, "sha256", bool(definition.store_sha256)):
+        raise _make_damage_error(path, "it is not what was written")
+    return definition
 
 
-def _make_damage_error(path: Path, error: ValidationError, place: str = "") -> InputError:
-    first = error.errors()[0]
-    problem = ": ".join(filter(None, (place, ".".join(map(str, first["loc"])), first["msg"])))
+def _is_sealed(contract: Contract, key: str, must_be: bool) -> bool:
+    """Return whether the hash at `key` is that of the rest; an empty one where none `must_be`."""
+    stated: str = getattr(contract, key)
+    return stated == _hash_contract(contract, key) if stated else not must_be
+
+
+def _make_damage_error(path: Path, error: ValidationError | str, place: str = "") -> InputError:
+    problem = error if isinstance(error, str) else _describe_first(error)
     return InputError(
-        f"damaged: {problem}", where=path, remedy="restore it, or start a new study elsewhere"
+        f"damaged: {place}: {problem}" if place else f"damaged: {problem}",
+        where=path,
+        remedy="restore it, or start a new study elsewhere",
     )
+
+
+def _describe_first(error: ValidationError) -> str:
+    first = error.errors()[0]
+    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
 
 
 def read_study_versions() -> dict[str, str]:
@@ -211,6 +265,14 @@ def hash_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
     return digest.hexdigest()[:16]
 
 
+def hash_stored(group: Any, names: Iterable[str], span: slice) -> str:
+    """Return the hash of the variables of cases as they are on the disk; "" if unreadable."""
+    try:
+        return hash_arrays({name: group[name][span] for name in names})
+    except READ_ERRORS:
+        return ""
+
+
 def remove_partial_files(folder: Path) -> None:
     """Remove what zarr leaves behind when a process dies while it writes."""
     for path in (folder / RESULTS_FOLDER).rglob("*.partial"):
@@ -233,9 +295,10 @@ def remove_unfinished_store(folder: Path) -> None:
 class Manifest:
     """The stored chunks: a line of `chunks.jsonl` each, in the order in which they came."""
 
-    def __init__(self, folder: Path, names: Iterable[str] = ()) -> None:
+    def __init__(self, folder: Path, names: Iterable[str]) -> None:
         """`names`: the variables of the study, in the order of the hash."""
         self._path, self._names = folder / MANIFEST_FILE, tuple(names)
+        self._is_sealed = bool(read_definition(folder).store_sha256)
         self.chunks = {chunk.chunk: chunk for chunk in self._read_lines()}
 
     def _read_lines(self) -> Iterator[StoredChunk]:
@@ -246,9 +309,13 @@ class Manifest:
             if not line.endswith("\n"):  # the process died while it wrote it
                 continue
             try:
-                yield StoredChunk.model_validate_json(line, extra="ignore")
+                chunk = StoredChunk.model_validate_json(line, extra="ignore")
             except ValidationError as error:
                 raise _make_damage_error(self._path, error, f"line {number}") from None
+            if not _is_sealed(chunk, "line_sha256", self._is_sealed):
+                problem = "it is not what was written"
+                raise _make_damage_error(self._path, problem, f"line {number}")
+            yield chunk
 
     def start(self, group: Any) -> None:
         """Drop a line that was cut, and those whose chunks are not what was stored.
@@ -256,21 +323,30 @@ class Manifest:
         After a loss of power the lines may be on the disk without their chunks.
         """
         self.chunks = {
-            number: chunk
-            for number, chunk in self.chunks.items()
-            if chunk.sha256 == self._hash_chunk(group, chunk)
+            number: chunk for number, chunk in self.chunks.items() if self.holds(group, chunk)
         }
         self._rewrite(self.chunks.values())
 
-    def _hash_chunk(self, group: Any, chunk: StoredChunk) -> str:
-        """Return the hash of a chunk as it is on the disk; "" if it cannot be read."""
-        try:
-            return hash_arrays({name: group[name][chunk.span] for name in self._names})
-        except (OSError, ValueError, RuntimeError):
-            return ""
+    def holds(self, group: Any, chunk: StoredChunk) -> bool:
+        """Return whether a chunk on the disk can be read and is what was computed."""
+        return chunk.sha256 == hash_stored(group, self._names, chunk.span)
+
+    def require_unchanged(self, group: Any) -> None:
+        """Raise InputError for the first chunk that is not on the disk as it was stored."""
+        for chunk in self.chunks.values():
+            if not self.holds(group, chunk):
+                last = chunk.first + chunk.cases - 1
+                raise InputError(
+                    f"chunk {chunk.chunk}, cases {chunk.first} to {last}, is not what was stored: "
+                    "altered or missing",
+                    where=self._path.parent / RESULTS_FOLDER,
+                    remedy=f"compute it again by `shaketwin map {self._path.parent} --resume`",
+                )
 
     def add(self, chunk: StoredChunk) -> None:
         """Add the line of a stored chunk; the line is on the disk when this returns."""
+        chunk = chunk.model_copy()
+        chunk.line_sha256 = _hash_contract(chunk, "line_sha256")
         with self._path.open("a", encoding="utf-8") as file:
             file.write(_format_line(chunk))
             file.flush()

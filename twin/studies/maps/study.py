@@ -25,12 +25,18 @@ from twin.studies.maps.sweep_outcomes import SWEEP_OUTCOMES
 
 
 class StudyDefinition(Contract):
-    """What determines every byte of the results, by which a study can be resumed."""
+    """What determines every byte of the results, by which a study can be resumed.
+
+    `store_sha256` is of the metadata and coordinates of the store, `sha256` of this file; both are
+    empty in a study of an earlier version.
+    """
 
     study_toml: str
     profile_toml: str
     model_toml: str
     versions: dict[str, str]
+    store_sha256: str = ""
+    sha256: str = ""
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from twin.studies.maps.store import (
     remove_partial_files,
     remove_unfinished_store,
     require_same_study,
+    require_unchanged_store,
 )
 from twin.studies.maps.study import Study
 from twin.system.grid import Watch, format_time_span, run_grid
@@ -93,13 +94,15 @@ def compute_map(options: MapOptions, watch: Watch | None = None) -> StoredMap:
         study = Study.read(path)
     workers.require()
     folder = _open_folder(study, path, out, options.resume)
-    manifest = Manifest(folder, [variable.name for variable in study.variables])
     config = study.config
+    if not options.resume:
+        _require_disk_space(study, folder, config.case_count)
+        create_store(folder, study, make_sweep_plan(study), sample_parameters(config))
+    require_unchanged_store(folder, study, read_definition(folder))
+    manifest = Manifest(folder, [variable.name for variable in study.variables])
     _require_disk_space(study, folder, config.case_count - manifest.case_count)
     watch.tell(config.title)
     watch.tell(_describe_size(study))
-    if not options.resume:
-        create_store(folder, study, make_sweep_plan(study), sample_parameters(config))
     group = open_group(folder, "r")
     manifest.start(group)
     if missing_count := config.case_count - manifest.case_count:
@@ -199,9 +202,15 @@ def _run_chunks(
             remedy="remove the cause and continue with --resume",
         )
 
-    def keep(number: int, chunk: StoredChunk | str) -> int:
+    group = open_group(folder, "r")
+
+    def find_fault(chunk: StoredChunk | str) -> str:
+        """Return why a chunk is not stored, whatever its worker says; "" if it is."""
         if isinstance(chunk, str):
-            raise describe_failure(number, chunk)
+            return chunk
+        return "" if manifest.holds(group, chunk) else "its chunk is not in the folder of the study"
+
+    def keep(_: int, chunk: StoredChunk) -> int:
         manifest.add(chunk)
         return chunk.cases
 
@@ -211,4 +220,5 @@ def _run_chunks(
         workers, keep, watch, unit="cases", total=study.config.case_count,
         done=manifest.case_count, describe_failure=describe_failure, max_task_s=MAX_CHUNK_S,
         find_problem=partial(find_sharing_problem, shared / DEFINITION_FILE, definition),
+        find_fault=find_fault,
     )  # fmt: skip
