@@ -14,7 +14,7 @@ from table_io.config.provenance import Provenance
 from table_io.config.toml_text import format_toml
 from tests.builders.rigs import read_model_text
 from tests.command_line import call_main
-from tests.sweeps.small_study import read_stored_bytes, write_study
+from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study
 from twin import api
 from twin.cli.table import COMMANDS
 from twin.results.contract import format_json
@@ -143,7 +143,7 @@ def compare_imports(log: Path, folder: Path) -> tuple[object, object]:
 
 
 def compare_maps(log: Path, folder: Path) -> tuple[object, object]:
-    study = write_study(folder)
+    study = write_study(folder, STUDY.replace("count = 6", "count = 2"))
     assert call_main("map", study, "--workers", 1, "--out", folder / "shell").returncode == 0
     stored = api.compute_map(api.MapOptions(study, folder / "python", workers=1))
     assert stored.is_complete

@@ -123,7 +123,7 @@ def of(items: Sequence[Item], kind: type) -> list:
 # The law of cuts
 
 
-@pytest.mark.parametrize("samples", [1, 7, 64, 500])
+@pytest.mark.parametrize("samples", [7, 64, 500])
 def test_cutting_the_samples_changes_no_bit(
     setup: pipeline.PipelineSetup, measured: Block, samples: int
 ) -> None:

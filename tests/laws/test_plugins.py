@@ -189,13 +189,15 @@ class TestInstalled:
     @pytest.mark.parametrize(
         ("truth", "name", "parameter", "value", "without"),
         [
-            (format_truth("bumper_cubic", kc=2e9), "cubic_bumper", "kc", 2e9, ("bumper_cubic",)),
-            (
+            pytest.param(
+                format_truth("bumper_cubic", kc=2e9), "cubic_bumper", "kc", 2e9, ("bumper_cubic",),
+                marks=pytest.mark.slow, id="bumper law",  # 20 s
+            ),
+            pytest.param(
                 format_truth("maxwell_damper", k1=8e3, tau=0.05), "zener_damper", "k1", 8e3,
-                ("maxwell_damper",),
+                ("maxwell_damper",), id="law with a state",
             ),
         ],
-        ids=["bumper law", "law with a state"],
     )  # fmt: skip
     def test_discovery_names_it_with_its_parameter(self, truth, name, parameter, value, without):
         others = {effect.id for effect in laboratory_laws.EFFECTS} - {name}

@@ -51,6 +51,7 @@ def test_an_open_verdict_counts_as_decided_only_if_the_next_is_right() -> None:
     assert "| 0 to 0.5 | 0.15 | 50.0 % (1/2;" in text
 
 
+@pytest.mark.slow  # 20 s
 def test_a_case_in_which_a_study_was_interrupted_is_begun_anew(tmp_path: Path) -> None:
     (number,) = list_case_numbers(1, ["single/coulomb_friction/10/1%"])
     folder = tmp_path / "cases" / draw_case(number).label
