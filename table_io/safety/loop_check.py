@@ -15,7 +15,7 @@ force.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,8 @@ from table_io.units import GRAVITY_M_S2
 TABLE_CHANNELS = ("table_disp_m", "table_acc_m_s2")
 MASS_CHANNELS = ("mass_disp_m", "mass_acc_m_s2")
 MOTION_CHANNELS = (*TABLE_CHANNELS, *MASS_CHANNELS, "rel_disp_m")
+LOAD_CELLS = RIGHT_CELLS + LEFT_CELLS
+NOISY = MOTION_CHANNELS + LOAD_CELLS
 
 MAX_LOST_PERCENT = 1.0  # of the samples
 MIN_TONE_SNR = 10.0  # tone over its standard error
@@ -52,6 +54,7 @@ DELAY_RANGE_MS = (-2.0, 100.0)
 MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
 MAX_READ_BACK_LSB, MAX_READ_BACK_RATIO = 4.0, 0.005  # DAC steps, and fraction of the command
 MIN_NOISE_MARGIN_DB = 20.0
+KNOWN_MARGIN_DB = 0.5  # by which noise may be more in a second of rest than the rig file states
 MAX_OFFSET_RATIO = 0.05  # of the motion of the test, or of the gap
 MAX_RESIDUAL_MOTION_RATIO, RESIDUAL_NOISE_FACTOR = (
     0.02,
@@ -237,22 +240,85 @@ def check_derivative_consistency(data: LoopCheckData) -> Iterator[Check]:
 
 
 def check_noise(data: LoopCheckData) -> Iterator[Check]:
-    """Check that the noise at rest is 20 dB below the test level at every frequency of the test.
+    """Check that the noise at rest is 20 dB below the motion of the test, at every frequency."""
+    channels = filter(data.has, NOISY)
+    for name, value, low, high, unit in list_noise_margins(data.profile, channels, data.noise):
+        label = "noise" if name in LOAD_CELLS else "noise under the level"
+        yield make_check(data, label, name, value, low, high, unit)
 
-    Displacements are compared with the smallest amplitude, that at the upper end of its band, load
-    cells with a fifth of the contact threshold `comparison.contact_n`.
+
+def list_noise_margins(
+    profile: Profile, channels: Iterable[str], noise: Callable[[str], float]
+) -> Iterator[tuple[str, float, float, float, str]]:
+    """Yield (channel, value, low, high, unit): the noise of each channel against the test.
+
+    Displacements are compared with the smallest amplitude, that at the upper end of the band, or
+    with the peak of a history, which has its displacement at the lower end; load cells with a fifth
+    of the contact threshold `comparison.contact_n`. `noise` returns the rms of a channel in SI.
     """
-    test_level = data.test_level
-    min_displacement = test_level / (2 * math.pi * data.profile.plan.high_hz) ** 2
-    for name in filter(data.has, MOTION_CHANNELS):
-        amplitude = min_displacement if CHANNEL_BY_NAME[name].unit == "m" else test_level
-        margin_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / data.noise(name))
-        yield make_check(
-            data, "noise under the level", name, margin_db, MIN_NOISE_MARGIN_DB, math.inf, "dB"
+    smallest_m = find_amplitude(profile, profile.plan.high_hz)
+    for name in channels:
+        if name in LOAD_CELLS:
+            yield name, noise(name), 0.0, profile.comparison.contact_n / 5.0, "N"
+            continue
+        is_displacement = CHANNEL_BY_NAME[name].unit == "m"
+        amplitude = smallest_m if is_displacement else profile.plan.level_m_s2
+        margin_db = 20.0 * math.log10(amplitude / math.sqrt(2.0) / noise(name))
+        yield name, margin_db, MIN_NOISE_MARGIN_DB, math.inf, "dB"
+
+
+def find_amplitude(profile: Profile, frequency_hz: float) -> float:
+    """Return the displacement of a test at a frequency in m; of a history its own peak."""
+    plan = profile.plan
+    if not plan.steps:
+        return float(np.abs(plan.target_m).max())
+    return plan.level_m_s2 / (2 * math.pi * frequency_hz) ** 2
+
+
+def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
+    """List what the loop check will refuse by what is known before: noise and converter steps.
+
+    By the noise that the rig file states. A sentence each, with the remedy.
+    """
+    if not profile.loop_check.enabled:
+        return []
+
+    def noise(name: str) -> float:
+        sensor = rig.sensor(name)
+        return max(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
+
+    faults = [
+        f"noise of {name} is {value:.3g} {unit}, allowed "
+        + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
+        + f" {unit}"
+        for name, value, low, high, unit in list_noise_margins(
+            profile, (name for name in NOISY if name in rig.channels), noise
         )
-    for name in filter(data.has, RIGHT_CELLS + LEFT_CELLS):
-        max_noise = data.profile.comparison.contact_n / 5.0
-        yield make_check(data, "noise", name, data.noise(name), 0.0, max_noise, "N")
+        if not low + (KNOWN_MARGIN_DB if unit == "dB" else 0.0)
+        <= value
+        <= high * 10 ** (-(KNOWN_MARGIN_DB if unit == "N" else 0.0) / 20)
+    ]
+    targets = plan_targets(profile, rig)
+    for name in TABLE_CHANNELS:
+        is_displacement = CHANNEL_BY_NAME[name].unit == "m"
+        ratios = [
+            target.level_m_s2
+            / ((2 * math.pi * target.frequency_hz) ** 2 if is_displacement else 1)
+            / noise(name)
+            * math.sqrt(
+                0.5
+                * profile.acquisition.rate_hz
+                * (count_hold_cycles(target, profile) - 1)
+                / target.frequency_hz
+            )
+            for target in targets
+        ]
+        if ratios and max(ratios) < MIN_TONE_SNR * 10 ** (KNOWN_MARGIN_DB / 20):
+            faults.append(
+                f"{name} is {max(ratios):.3g} times its noise in the loop check, allowed at least "
+                f"{MIN_TONE_SNR:g} times"
+            )
+    return faults
 
 
 def check_rest(data: LoopCheckData) -> Iterator[Check]:
@@ -263,7 +329,7 @@ def check_rest(data: LoopCheckData) -> Iterator[Check]:
     """
     test_level = data.test_level
     min_gap = min(data.profile.specimen.gaps_m)
-    max_displacement = test_level / (2 * math.pi * data.profile.plan.low_hz) ** 2
+    max_displacement = find_amplitude(data.profile, data.profile.plan.low_hz)
     max_displacement = min(max_displacement, min_gap) if min_gap > 0 else max_displacement
     for name in filter(data.has, MOTION_CHANNELS):
         is_displacement = CHANNEL_BY_NAME[name].unit == "m"
@@ -293,7 +359,6 @@ def _finite_rms(values: Float1D) -> float:
     return float(np.sqrt(np.mean(finite**2))) if finite.size else math.nan
 
 
-LOAD_CELLS = RIGHT_CELLS + LEFT_CELLS
 NEAR_GAP_RATIO = 0.9  # of the gap: below this displacement there is no contact
 MIN_NOISE_RATIO = 0.1  # of the noise stated in the rig file
 MIN_LOADED_SNR = 50.0  # tone over its standard error above which a cell counts as loaded
@@ -431,7 +496,7 @@ REMEDIES = {
     "swapped",
     "noise": "check for ground loops and the range, or raise the level of the excitation",
     "offset": "tare again with the table at rest and the bumpers unloaded",
-    "preload": "take a tare with the bumpers clear of the mass (shaketwin tare), else correct the "
+    "preload of": "tare with the bumpers clear of the mass (shaketwin tare), else correct the "
     "gap of the profile or the bumper stiffness of the model",
     "motion left": "let the servo come to rest, or raise loop_check.rest_s",
     "cross-talk": "check that the gap is as large as stated; if so, the cell responds to the "

@@ -17,7 +17,7 @@ from table_io.control.order_tracking import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, HistorySegment, Segment, envelope_acceleration
 from table_io.records import FrequencyResponse, Step
-from table_io.safety.loop_check import plan_targets
+from table_io.safety.loop_check import list_known_faults, plan_targets
 from table_io.units import GRAVITY_M_S2
 
 LOOP_CHECK = "loop check"
@@ -222,6 +222,15 @@ def check_limits(
         *_find_exceeded_limits(rows, rig, _suggest_level(rows, profile, rig), level_key),
         *_find_clipped_sensors(rows, rig),
         *_find_coarse_outputs(rows, rig, level_key),
+        *(
+            InputError(
+                sentence,
+                where="loop check",
+                remedy="raise the level, use a quieter sensor or a smaller range, or correct "
+                "noise_rms in the rig file",
+            )
+            for sentence in list_known_faults(profile, rig)
+        ),
     ]
     if faults:
         raise InputError(

@@ -375,6 +375,11 @@ class TrackingError(Contract):
 class TrackingResult(TrackingError):
     """Motion of the table against the displacement history that it should follow."""
 
+    acc_rms_error_record: RealRatio = Field(
+        math.nan,
+        description="as `acc_rms_error_band`, against the record itself, before the band filter of "
+        "the profile; null of a history that is no acceleration record",
+    )
     from_s: Seconds = Field(description="begin of the history")
     to_s: Seconds = Field(description="end of the part that was played")
     required_spectrum: RequiredSpectrumResult | None = Field(

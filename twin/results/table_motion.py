@@ -7,16 +7,17 @@ import numpy as np
 
 from table_io.block import Block, Float1D, Label
 from table_io.config.excitation import History, history_acceleration
+from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile
 from table_io.config.tracking import RequiredSpectrum, TrackingConfig
 from twin.recording.reader import Recording
-from twin.results.contracts import RequiredSpectrumResult, TrackingResult
+from twin.results.contracts import RequiredSpectrumResult, TrackingError, TrackingResult
 from twin.results.spectra import (
     USUAL_PER_OCTAVE,
     compute_response_spectrum,
     list_octave_frequencies,
 )
-from twin.results.tracking import MAX_BAND_RATIO, MAX_LAG_S, judge_tracking
+from twin.results.tracking import MAX_BAND_RATIO, MAX_LAG_S, find_record_error, judge_tracking
 from twin.results.windows import find_windows, join_channel
 
 
@@ -124,10 +125,27 @@ def summarise_tracking(recording: Recording, profile: Profile) -> TrackingResult
     required = config.spectrum
     return TrackingResult(
         **dict(error),
+        acc_rms_error_record=_judge_by_record(motion, profile, error),
         from_s=motion.start / motion.rate_hz,
         to_s=motion.end / motion.rate_hz,
         required_spectrum=None if required is None else _check_required(motion, required, config),
     )
+
+
+def _judge_by_record(motion: TableMotion, profile: Profile, error: TrackingError) -> float:
+    """Return the error of the table in the band against the record itself; NaN without one."""
+    excitation = profile.excitation
+    record = (
+        excitation.record_acceleration(motion.rate_hz)
+        if isinstance(excitation, RecordedHistory)
+        else None
+    )
+    if record is None:
+        return math.nan
+    return find_record_error(
+        record, motion.target_acc_m_s2, motion.achieved_acc_m_s2, motion.rate_hz,
+        error.band_hz, error.lag_s,
+    )  # fmt: skip
 
 
 def list_required_frequencies(required: RequiredSpectrum, rate_hz: float) -> Float1D:
@@ -178,9 +196,11 @@ def format_tracking(tracking: TrackingResult) -> str:
     """Format the tracking error of a summary in one sentence: RMS, PGA, SA, lag, RRS."""
     low_hz, high_hz = tracking.band_hz
     band = f"{low_hz:.2g} to {high_hz:.2g} Hz"
+    own = tracking.acc_rms_error_record
     parts = [
         f"table acceleration {_format_percent(tracking.acc_rms_error_band)} RMS off its target "
-        f"in {band} ({_format_percent(tracking.acc_rms_error_full)} in full)",
+        f"in {band} ({_format_percent(tracking.acc_rms_error_full)} in full"
+        + (f", {_format_percent(own)} off the record itself)" if math.isfinite(own) else ")"),
         f"PGA {_format_percent(tracking.pga_ratio_band)} of it "
         f"({_format_percent(tracking.pga_ratio_full)})",
     ]

@@ -116,6 +116,41 @@ def judge_tracking(
     )
 
 
+def align_record(record_acc: Float1D, target_acc: Float1D) -> Float1D:
+    """Return a record at the samples of the target that was made of it, (sample,).
+
+    Both have one time scale; the target begins with rest and blends. Its place is that of the
+    highest cross-correlation, which a zero-phase filter does not move.
+    """
+    size = 1 << (record_acc.size + target_acc.size).bit_length()
+    cross = np.fft.irfft(
+        np.fft.rfft(target_acc, size) * np.conj(np.fft.rfft(record_acc, size)), size
+    )
+    shift = int(np.argmax(cross))
+    shift -= size if shift > size // 2 else 0
+    aligned = np.zeros(target_acc.size)
+    first, last = max(shift, 0), min(shift + record_acc.size, target_acc.size)
+    aligned[first:last] = record_acc[first - shift : last - shift]
+    return aligned
+
+
+def find_record_error(
+    record_acc: Float1D,
+    target_acc: Float1D,
+    motion_acc: Float1D,
+    rate_hz: float,
+    band_hz: tuple[float, float],
+    lag_s: float = 0.0,
+) -> float:
+    """Return the rms error of a motion in a band against the record itself, over its rms there.
+
+    The record is as it was before the filter of its profile (`align_record`). NaN if samples of
+    the motion are missing.
+    """
+    record = delay_record(align_record(record_acc, target_acc), lag_s, rate_hz)
+    return _find_rms_errors(record, motion_acc, rate_hz, band_hz)[0]
+
+
 def find_band(target_acc: Float1D, rate_hz: float) -> tuple[float, float]:
     """Return the band (low, high) in Hz in which a target is judged if none is stated.
 

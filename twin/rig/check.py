@@ -13,6 +13,7 @@ from table_io.adaptive.policy import describe_adaptive_test
 from table_io.backends import open_backend
 from table_io.block import Label
 from table_io.clock import ManualClock
+from table_io.config.excitation import history_acceleration
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.excitation.stepped_sine import Sweep
@@ -26,6 +27,7 @@ from table_io.safety.preflight import (
     list_limits,
 )
 from table_io.units import GRAVITY_M_S2
+from twin.results.tracking import find_band, find_record_error
 from twin.rig.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_response
 from twin.setup.disk import planned_bytes
 from twin.setup.folders import make_output_folder
@@ -33,6 +35,7 @@ from twin.setup.run_config import RunConfig, make_run_id, read_run_config
 from twin.setup.warnings import list_test_warnings
 from twin.system.terminal import console, print_line, print_table
 
+MAX_FILTER_ERROR = 0.02  # rms, of a record by the filter of its profile, in the judged band
 MAX_STEP_ROWS = 12  # frequencies in the table of steps
 
 
@@ -64,10 +67,32 @@ def check_config(config: RunConfig) -> CheckedTest:
     predicted = predict_response(config)
     warnings = (
         *list_test_warnings(config),
+        *_list_filter_warnings(config.profile),
         *format_clipping_warnings(predicted.peaks, config.rig),
         *predicted.range_exits,
     )
     return CheckedTest(config, predicted.peaks, warnings)
+
+
+def _list_filter_warnings(profile: Profile) -> list[str]:
+    """Return a warning if the filter of a record reaches into the band in which it is judged."""
+    excitation, rate_hz = profile.excitation, profile.acquisition.rate_hz
+    if not isinstance(excitation, RecordedHistory) or excitation.applied_band_hz is None:
+        return []
+    record = excitation.record_acceleration(rate_hz)
+    if record is None:
+        return []
+    target = history_acceleration(excitation.target(rate_hz), rate_hz)
+    band_hz = profile.tracking.band_hz or find_band(target, rate_hz)
+    error = find_record_error(record, target, target, rate_hz, band_hz)
+    if not error > MAX_FILTER_ERROR:
+        return []
+    low_hz, high_hz = excitation.applied_band_hz
+    return [
+        f"the filter of the record, {low_hz:.3g} to {high_hz:.3g} Hz, changes it by "
+        f"{100 * error:.2g} % rms in the band in which the table is judged, {band_hz[0]:.3g} to "
+        f"{band_hz[1]:.3g} Hz: widen excitation.band_hz, or narrow tracking.band_hz"
+    ]
 
 
 def print_check(profile: Path, table: str | None, out: Path | None) -> None:

@@ -167,6 +167,18 @@ class RecordedHistory(SeriesKeys, History):
         rate_hz = self.series.rate_hz / self.time_ratio
         return _choose_band(self.band_hz, self.series, rate_hz)
 
+    def record_acceleration(self, rate_hz: float) -> Float1D | None:
+        """Return the acceleration of the file in m/s2, scaled and resampled, (sample,).
+
+        Without the band filter and the baseline, by which the target differs from it. None of a
+        displacement, which is its own target.
+        """
+        values, file_rate_hz = self.samples
+        if self.series.quantity != "acceleration":
+            return None
+        scaled = self.scale * self.acceleration_ratio * values
+        return resample(scaled, file_rate_hz / self.time_ratio, rate_hz)
+
     def displacement(self, rate_hz: float) -> Float1D:
         """Return the history from rest to rest in m at a sampling rate, (sample,)."""
         values, file_rate_hz = self.samples

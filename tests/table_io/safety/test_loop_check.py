@@ -429,6 +429,9 @@ def test_relative_displacement_is_compared_with_the_accelerometer(
 
 def test_every_line_that_can_fail_has_a_remedy() -> None:
     checks = {check for name in ("g4_ss2", "gm1") for check in evaluate_checks(name)}
+    profile, block, drive, noise = record_loop_check("gm1")
+    preload_n = ((0.0, 500.0), (0.0, 500.0))
+    checks |= set(evaluate(block, drive, profile, RIG, noise, preload_n)[0])
     for check in checks:
         limited = math.isfinite(check.low) or math.isfinite(check.high)
         assert bool(find_remedy(check)) == limited, check.name
