@@ -1,5 +1,6 @@
 """Loading of TOML files into validated, frozen models; one message lists all faults of a file."""
 
+import re
 import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -96,6 +97,9 @@ def require_both(key: str, value: object, other: str, info: ValidationInfo) -> N
         raise InputError(f"{other} and {key} go together", remedy="give both or neither")
 
 
+NULL_CHARACTER = re.compile(r"\0|\\u0000|\\U00000000")  # itself, and as TOML writes it
+
+
 def find_attached_text(name: str | None, info: ValidationInfo) -> str | None:
     """Return the text of a file that a key names; None without one, or if `files` is at fault.
 
@@ -138,7 +142,7 @@ def _make_fault(model: type[ConfigModel], error: Any, raw: Any) -> InputError:
     if not isinstance(cause, InputError):
         return InputError(str(cause), key=key)
     if cause.key or cause.where:  # a key or place below this key of the file
-        return cause.add_place(key)
+        return cause.add_place(key) if location else cause
     return cause.replace(key=key)
 
 
@@ -162,15 +166,22 @@ def parse_toml(text: str, model: type[ConfigT], source: str) -> ConfigT:
 
 
 def read_text(path: Path, kind: str) -> str:
-    """Read the text of a file; InputError names the kind of file and the TOML files next to it."""
+    """Read the text of a file; InputError names the kind of file and the TOML files next to it.
+
+    A null character is refused here, before any name in the text is used as that of a file.
+    """
     try:
-        return path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         siblings = sorted(other.name for other in path.parent.glob("*.toml"))
         hint = f"there: {', '.join(siblings)}" if siblings else "give the path of a TOML file"
         raise InputError(f"no such {kind}", where=path, remedy=hint) from None
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read this {kind}: {error}", where=path) from None
+    if null := NULL_CHARACTER.search(text):
+        line = text.count("\n", 0, null.start()) + 1
+        raise InputError("a null character", where=path, key=f"line {line}", remedy="remove it")
+    return text
 
 
 def load_config(path: Path, model: type[ConfigT], kind: str) -> tuple[ConfigT, str]:

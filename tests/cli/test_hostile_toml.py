@@ -10,10 +10,14 @@ from types import FrameType
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import PROFILES_DIR, load_config
 from table_io.errors import InputError
 from twin.campaign.config import read_plan
+from twin.discovery.features.config import FeatureSet
+from twin.earthquakes.result import load_table_twin
+from twin.model.config import load_model_config
 from twin.setup.run_config import read_run_config
+from twin.studies.maps.study import Study
 
 # Short ones, of every kind of excitation and backend.
 FILES = {
@@ -21,14 +25,48 @@ FILES = {
     "rigs": ["simulated", "hydraulic", "udp_simulated", "ni_simulated", "machine"],
     "models": ["snm"],
     "campaigns": ["paper"],
+    "studies": ["bumper_design", "discovery_power", "fold_sensitivity"],
+    "features": ["paper"],
+    "effects": ["softening"],
+    "twins": ["delayed"],
 }
-FAST_COUNT, SLOW_COUNT = 27, 1000
+OWN = {  # of kinds that are not shipped
+    "effects": """
+id = "softening"
+title = "A spring that softens"
+place = "damper"
+force = "-k * u * abs(u) / (1 + abs(u) / w)"
+citation = "by hand"
+[parameters]
+k = { unit = "N/m2", low = 0.0, high = 1e9, vanishing = 0.0, typical = 1e6 }
+[parameters.w]
+unit = "m"
+low = 1e-4
+high = 1.0
+typical = 1e-2
+[range]
+u = [-0.006, 0.006]
+""",
+    "twins": """
+title = "A table that is late"
+mass_kg = 1000.0
+residual = 0.02
+structure = "delay_gain"
+[response]
+delay_s = 0.012
+band_hz = [0.5, 30.0]
+lags_s = [0.0, 0.01]
+[response.coefficients]
+command = [1.0, 0.1]
+""",
+}
+FAST_COUNT, SLOW_COUNT = 40, 1400
 HANGS_S = 30  # of one file
 VALUES = (
     "0", "-1", "1", "3", "1e9", "1e308", "-1e308", "1e-308", "1e-9", "nan", "inf", "-inf", '""',
     '"x"', '"\\u001b[31m"', "true", "false", "[]", "[1.0]", "[[]]", "{}", '["x", 1]',
     "9223372036854775807", "99999999999999999999", "1979-05-27", "0.5",
-    '"nan"', '"../x"', "1000000",
+    '"nan"', '"../x"', "1000000", '"x\\u0000.toml"',
 )  # fmt: skip
 KEY_LINE = re.compile(r"^(\s*)([\w.\"-]+)(\s*=\s*)(.+)$")
 TABLE_LINE = re.compile(r"^\[+[\w.\"-]+\]+\s*$")
@@ -100,6 +138,17 @@ def load(kind: str, path: Path) -> None:
         read_plan(path, None, None, lambda _config, _path: None)
     elif kind == "tests":
         read_run_config(path)
+    elif kind == "studies":
+        Study.read(path)
+    elif kind == "features":
+        load_config(path, FeatureSet, "features file")
+    elif kind == "twins":
+        load_table_twin(path).build_model()
+    elif kind == "effects":
+        model = path.with_name(f"model_of_{path.name}")
+        entry = f'[[effects]]\nfile = "{path.name}"\nparameters = {{ k = 1e3, w = 0.01 }}\n'
+        model.write_text((PROFILES_DIR / "models" / "snm.toml").read_text() + entry)
+        load_model_config(model)
     else:
         option = {"rigs": "table", "models": "model"}[kind]
         read_run_config(Path("quickstart"), **{option: str(path)})
@@ -139,9 +188,13 @@ def try_files(folder: Path, numbers: range) -> list[str]:
     signal.signal(signal.SIGVTALRM, fail_late)
     for number in numbers:
         kind, name = names[number % len(names)]
-        original = (PROFILES_DIR / kind / f"{name}.toml").read_bytes()
+        if kind in OWN:
+            original = OWN[kind].encode()
+        else:
+            original = (PROFILES_DIR / kind / f"{name}.toml").read_bytes()
         content = mutate_text(original, random.Random(number))
         path = folder / "profiles" / kind / f"mutant{number}.toml"
+        path.parent.mkdir(exist_ok=True)
         path.write_bytes(content)
         signal.setitimer(signal.ITIMER_VIRTUAL, HANGS_S)
         failure = describe_failure(kind, path)

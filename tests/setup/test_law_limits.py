@@ -11,6 +11,7 @@ from table_io.errors import InputError
 from table_io.records import Event
 from twin.model.config import load_model_config
 from twin.model.model import Model
+from twin.model.prepare import prepare_solver
 from twin.recording.reader import read_recording
 from twin.results.summary import summarise
 from twin.setup.run_config import read_model, read_run_config
@@ -151,3 +152,13 @@ def test_lost_samples_are_no_failure_of_the_twin(tmp_path: Path) -> None:
     play_unpaced(config, "own", path, lambda: None, lambda _: None)
     recording = read_recording(path)
     assert not [e for e in recording.records(Event) if e.kind == "twin_failed"]
+
+
+def test_law_without_a_static_equilibrium_is_refused_in_words(tmp_path: Path) -> None:
+    """Its pole, -1 / q, is at a place where the equilibrium is sought: that of the gap."""
+    model = write_model(tmp_path, "k * (1e-3 / q + u / (1 + u * q))", "k = 1e3, q = 500.0")
+    own = load_model_config(model)[0].build_model(
+        read_run_config(write_profile(tmp_path, "snm")).profile.specimen
+    )
+    with pytest.raises(InputError, match=r"effect 'own'.*no static equilibrium"):
+        prepare_solver(own, 1000.0).rest_state()

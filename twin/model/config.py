@@ -176,6 +176,8 @@ def load_model_config(path: Path) -> tuple[ModelConfig, str]:
         names = {}  # reported when the text is parsed
     if names:
         texts = {name: _read_effect_file(name, path) for name in names}
+        for name, law in texts.items():
+            parse_toml(law, EffectFile, str(path.parent / name))
         text = f"{text}\n{format_toml({'files': texts})}"
     return parse_toml(text, ModelConfig, str(path)), text
 

@@ -71,7 +71,14 @@ class EventDrivenSolver:
         u, coefficients = float(linear_state[0]), self.coefficients
         if coefficients.k3 or coefficients.k2 or self.laws:
             time_s = index * coefficients.period
-            u = equilibrium_disp(p, u, coefficients, self.laws, time_s)
+            try:
+                u = equilibrium_disp(p, u, coefficients, self.laws, time_s)
+            except (ArithmeticError, ValueError) as error:
+                raise InputError(
+                    f"no static equilibrium: its laws cannot be evaluated at rest ({error})",
+                    where=", ".join(f"effect {effect.id!r}" for effect, _ in self.model.added_laws),
+                    remedy="use laws that are finite there",
+                ) from None
         state = self._blank_state(index)
         state[:6] = linear_state[:6]
         state[0] = u

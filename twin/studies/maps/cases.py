@@ -117,7 +117,7 @@ def parameter_unit(name: str, further_names: Iterable[str] = ()) -> str:
         known = [f"effects.{effect_id}.{parameter}" for parameter in units]
     else:
         known = [*list_parameter_names(), *further_names]
-    raise InputError("no parameter of a study", key=name, remedy=suggest(name, known))
+    raise InputError("no parameter of a study", key=name or "name", remedy=suggest(name, known))
 
 
 def list_parameter_names() -> list[str]:

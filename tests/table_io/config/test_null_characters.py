@@ -1,0 +1,47 @@
+"""A null character in a TOML file, which no file name can have."""
+
+from pathlib import Path
+
+import pytest
+
+from table_io.config.base import PROFILES_DIR
+from table_io.errors import InputError
+from twin.campaign.config import read_plan
+from twin.model.config import load_model_config
+from twin.setup.run_config import read_run_config
+
+QUICKSTART = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()
+
+
+@pytest.mark.parametrize("null", ["\\u0000", "\\U00000000"])
+@pytest.mark.parametrize("key", ["rig", "model"])
+def test_null_character_in_a_file_name_is_refused_with_its_line(
+    tmp_path: Path, key: str, null: str
+) -> None:
+    path = tmp_path / "test.toml"
+    lines = [line for line in QUICKSTART.splitlines() if not line.startswith(f"{key} =")]
+    path.write_text("\n".join([f'{key} = "x{null}.toml"', *lines]))
+    with pytest.raises(InputError, match=r"test.toml: line 1: a null character; remove it"):
+        read_run_config(path)
+
+
+def test_null_character_in_the_file_of_a_record_or_of_a_run_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "record.toml"
+    text = (PROFILES_DIR / "tests" / "el_centro.toml").read_text()
+    path.write_text(text.replace('file = "el_centro.csv"', 'file = "x\\u0000.csv"'))
+    with pytest.raises(InputError, match="a null character"):
+        read_run_config(path)
+    path.write_text('title = "x"\n[[runs]]\nprofile = "x\\u0000.toml"\n')
+    with pytest.raises(InputError, match="line 3: a null character"):
+        read_plan(path, None, None, lambda _config, _path: None)
+
+
+def test_fault_of_an_effect_file_names_the_effect_file(tmp_path: Path) -> None:
+    model = tmp_path / "model.toml"
+    text = (PROFILES_DIR / "models" / "snm.toml").read_text()
+    model.write_text(f'{text}\n[[effects]]\nfile = "own.toml"\nparameters = {{ k = 1.0 }}\n')
+    (tmp_path / "own.toml").write_text('id = "own"\nforce = "k * w"\n[parameters]\n')
+    with pytest.raises(InputError) as caught:
+        load_model_config(model)
+    assert caught.value.where == str(tmp_path / "own.toml")
+    assert "model.toml" not in str(caught.value)
