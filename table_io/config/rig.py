@@ -202,6 +202,12 @@ class TableResponse(ConfigModel):
         description="Supply pressure times piston area, for the table's twin; omitted: no load "
         "slows the flow of the valve.",
     )
+    lag_ms: Positive = Field(
+        15.0,
+        le=200,
+        description="Lag of the table behind its command near the first resonance, which the gains "
+        "of a feedback allow for.",
+    )
     delay_spread_ms: Positive = Field(
         5.0, description="Spread of the delay over the frequencies; at least half of its mean."
     )

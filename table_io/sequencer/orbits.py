@@ -127,9 +127,12 @@ def check_latency(state: SequencerState) -> str:
     allowed_s = plan.latency_s + plan.jitter_s + LATENCY_TOLERANCE_S
     if not latency_s > allowed_s:
         return ""
+    lag_s = latency_s - state.plan.feedback_horizon / state.trajectory.rate_hz
     return (
         f"the latency of the feedback is {1e3 * latency_s:.1f} ms, its gains are for at most "
-        f"{1e3 * allowed_s:.1f} ms: compute the orbit plan for this latency"
+        f"{1e3 * allowed_s:.1f} ms: the table lags by {1e3 * lag_s:.1f} ms, state it as "
+        f"table_response.lag_ms = {math.ceil(1e3 * lag_s)} in the rig file, for which the orbit "
+        "plan is then computed"
     )
 
 

@@ -311,22 +311,28 @@ def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> 
     horizon = max(math.ceil(DECISION_HORIZON_S * rate), profile.acquisition.block_samples)
     feedback_horizon = replace_after + math.ceil(FEEDBACK_HORIZON_S * rate)
     if profile.continuation is not None:
-        _check_horizon(profile.continuation, feedback_horizon / rate)
+        _check_horizon(profile.continuation, rig, feedback_horizon / rate)
         _check_sensors(rig)
     return TestPlan(
         profile, rig, replace_after + horizon + 1, make_policy(profile), feedback_horizon
     )
 
 
-def _check_horizon(config: Continuation, horizon_s: float) -> None:
+def find_lag_ms(config: Continuation, rig: RigConfig) -> float:
+    """Return the lag of the table in ms that the gains of a feedback allow for."""
+    return rig.table_response.lag_ms if config.table_lag_ms is None else config.table_lag_ms
+
+
+def _check_horizon(config: Continuation, rig: RigConfig, horizon_s: float) -> None:
     """Raise InputError if the feedback comes too late with the stated lag of the table."""
     plan = config.orbit_plan
-    latency_s, allowed_s = horizon_s + 1e-3 * config.table_lag_ms, plan.latency_s + plan.jitter_s
+    lag_ms, allowed_s = find_lag_ms(config, rig), plan.latency_s + plan.jitter_s
+    latency_s = horizon_s + 1e-3 * lag_ms
     if latency_s > allowed_s:
         raise InputError(
             f"the table answers {1e3 * latency_s:.1f} ms after a block at the soonest: "
             f"{1e3 * horizon_s:.1f} ms until its command can change and a lag of "
-            f"{config.table_lag_ms:g} ms",
+            f"{lag_ms:g} ms",
             where="continuation",
             key="latency_s",
             value=plan.latency_s,

@@ -51,6 +51,19 @@ def test_plan_goes_through_both_folds(plan):
     assert 4.02 < frequencies[-1] < 4.0274
 
 
+@pytest.mark.parametrize("start_hz", [2.85, 3.4, 3.9])
+def test_range_that_begins_between_the_folds_is_reached_from_below_the_lower_one(start_hz):
+    plan = make_orbit_plan(Model(snm()), (start_hz, 4.1), AG, 8, FEEDBACK_TIMING)
+    stable = [point.stable for point in plan.points]
+    assert stable[0]
+    assert stable.index(False) == 3
+    unstable_hz = [point.frequency_hz for point in plan.points if not point.stable]
+    assert unstable_hz == sorted(unstable_hz)
+    assert unstable_hz[0] < 2.83
+    assert abs(sum(f >= start_hz for f in unstable_hz) - 8) <= 1
+    assert max(np.diff(unstable_hz)) < 0.25
+
+
 def test_orbits_of_the_plan_are_those_of_the_model(plan):
     unstable = [point for point in plan.points if not point.stable]
     frequencies = [point.frequency_hz for point in unstable]

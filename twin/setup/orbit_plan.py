@@ -5,6 +5,7 @@ here if it cannot be done: no unstable orbit or no phase resonance in the range,
 which no gains hold them.
 """
 
+import math
 import re
 import tomllib
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.sequencer.procedure import FEEDBACK_HORIZON_S, make_test_plan
+from table_io.sequencer.procedure import FEEDBACK_HORIZON_S, find_lag_ms, make_test_plan
 from table_io.units import GRAVITY_M_S2
 from twin.dynamics.arclength import NoConvergence, correct, weighted_length
 from twin.dynamics.continuation import Branch, continue_branch, make_problem, orbit_weights
@@ -34,6 +35,7 @@ from twin.setup.phase_resonance import find_phase_resonance, find_resonance_appr
 RANGE_MARGIN = 1.2  # ratio of frequencies by which the branch is followed beyond the range
 REFUSAL_MARGIN = 1.6  # the same, to tell where unstable orbits are
 LEAD_ORBITS = 3  # stable ones before and after the unstable ones
+LEAD_SPACING = 0.04  # of the unstable part, between orbits on the way from its fold to the range
 PLAN_HARMONICS = 9
 MODEL_ERROR = 0.05  # relative error of mass and of stiffness with which the gains must hold
 JITTER_S = 0.005  # of blocks that arrive late; the feedback horizon absorbs smaller ones
@@ -56,7 +58,9 @@ class UnstableStretch:
     def divide(self, range_hz: tuple[float, float], points: int) -> list[float]:
         """Return positions of unstable orbits in a range, evenly spaced, and of stable ones.
 
-        The stable ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds.
+        The stable ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds. A
+        range that begins between the folds is reached from below the lower one, where rest leads to
+        the branch: the orbits on the way are measured too, LEAD_SPACING apart.
         """
         frequencies = np.array([orbit.frequency_hz for orbit in self.orbits])
         fine = np.linspace(0.0, 1.0, FINE_POSITIONS)
@@ -65,9 +69,11 @@ class UnstableStretch:
         low, high = float(inside[0]), float(inside[-1])
         numbers = np.arange(-LEAD_ORBITS, points + LEAD_ORBITS) + 0.5
         positions = low + numbers / points * (high - low)
-        first = self.positions[0] if low == 0.0 else low
         last = self.positions[-1] if high == 1.0 else high
-        return [float(p) for p in positions if first <= p <= last]
+        if low > 0.0:
+            way = LEAD_SPACING * (np.arange(-LEAD_ORBITS, math.ceil(low / LEAD_SPACING)) + 0.5)
+            positions = np.append(way[way < low], positions[positions > low])
+        return [float(p) for p in positions if self.positions[0] <= p <= last]
 
     def orbit_at(self, position: float) -> Orbit:
         """Return the orbit at a position by Newton's method."""
@@ -137,9 +143,10 @@ def _plan_orbit(orbit: Orbit, gains: tuple[float, float]) -> PlannedOrbit:
 def find_unstable_stretch(period_map: PeriodMap, range_hz: tuple[float, float]) -> UnstableStretch:
     """Return the longest unstable part between folds in a frequency range, with its surroundings.
 
-    The branch is that of the orbit to which rest settles above the range. InputError without one.
+    The branch is that of the orbit to which rest settles above the range, followed until it holds
+    the lower fold, below which rest leads to it. InputError without one.
     """
-    low_hz, high_hz = range_hz[0] / RANGE_MARGIN, range_hz[1] * RANGE_MARGIN
+    high_hz = range_hz[1] * RANGE_MARGIN
     start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
     if start is None:
         raise InputError(
@@ -148,19 +155,29 @@ def find_unstable_stretch(period_map: PeriodMap, range_hz: tuple[float, float]) 
             value=range_hz[1],
             remedy="choose another range",
         )
-    branch = continue_branch(start, FREQUENCY, (low_hz, high_hz))
-    stretches = [
-        stretch
-        for stretch in _split_unstable(branch)
-        if any(
-            not orbit.stable and range_hz[0] <= orbit.frequency_hz <= range_hz[1]
-            for orbit in stretch.orbits
-        )
-    ]
+    for margin in (RANGE_MARGIN, REFUSAL_MARGIN):
+        branch = continue_branch(start, FREQUENCY, (range_hz[0] / margin, high_hz))
+        stretches = [
+            stretch
+            for stretch in _split_unstable(branch)
+            if any(
+                not orbit.stable and range_hz[0] <= orbit.frequency_hz <= range_hz[1]
+                for orbit in stretch.orbits
+            )
+        ]
+        if stretches:
+            longest = max(stretches, key=lambda stretch: sum(not o.stable for o in stretch.orbits))
+            if longest.positions[0] < 0.0:
+                return longest
     if not stretches:
-        lower_hz = range_hz[0] / REFUSAL_MARGIN
-        raise _make_refusal(continue_branch(start, FREQUENCY, (lower_hz, high_hz)), range_hz)
-    return max(stretches, key=lambda stretch: sum(not orbit.stable for orbit in stretch.orbits))
+        raise _make_refusal(branch, range_hz)
+    raise InputError(
+        f"the lower fold of the branch lies below {range_hz[0] / REFUSAL_MARGIN:.4g} Hz, and rest "
+        "leads to the branch only below it",
+        key="excitation.start_hz",
+        value=range_hz[0],
+        remedy="lower start_hz",
+    )
 
 
 def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
@@ -323,7 +340,7 @@ def find_timing(profile: Profile, rig: RigConfig) -> FeedbackTiming:
     assert config is not None
     rate_hz = profile.acquisition.rate_hz
     horizon_s = _find_replace_after(profile, rig) / rate_hz + FEEDBACK_HORIZON_S
-    latency_s = horizon_s + 1e-3 * config.table_lag_ms
+    latency_s = horizon_s + 1e-3 * find_lag_ms(config, rig)
     return FeedbackTiming(latency_s, JITTER_S, profile.acquisition.block_samples / rate_hz)
 
 

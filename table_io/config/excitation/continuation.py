@@ -56,8 +56,11 @@ class Continuation(Excitation):
         description="Of an accepted orbit, to measure its Floquet multiplier; 0: not measured.",
     )
     retries: Count = Field(3, ge=0, le=100, description="Of a point where the orbit is lost.")
-    table_lag_ms: Positive = Field(
-        15.0, le=200, description="Lag of the table behind its command, which the gains allow for."
+    table_lag_ms: Positive | None = Field(
+        None,
+        le=200,
+        description="Lag of the table behind its command, which the gains allow for; omitted: "
+        "table_response.lag_ms of the rig.",
     )
     files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
     file: str | None = Field(None, description="Orbit plan; omitted: `run` computes it.")

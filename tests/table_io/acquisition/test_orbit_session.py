@@ -232,6 +232,7 @@ def test_operator_stops_a_held_orbit(held: PlayedSession) -> None:
 def test_plan_for_a_shorter_latency_is_refused_before_the_orbits() -> None:
     refused = play_session(make_profile(latency_s=0.031, table_lag_ms=1.0))
     assert refused.select(RunStop)[0].verdict == "aborted"
+    assert "table_response.lag_ms = 1" in refused.select(RunStop)[0].reason
     assert not refused.select(OrbitPoint)
     assert np.abs(refused.command_m).max() < 2e-4  # the loop check only
 
