@@ -536,6 +536,29 @@ def test_swing_is_the_mean_over_whole_cycles() -> None:
     assert math.isnan(mean_swing(np.empty(0), np.empty(0)))
 
 
+@pytest.mark.parametrize("noise_m", [0.0, 5e-6, 15e-6, 30e-6])
+@pytest.mark.parametrize("cycles", [4, 10])
+def test_swing_of_an_orbit_does_not_grow_with_the_noise_of_its_sensor(
+    noise_m: float, cycles: int
+) -> None:
+    """A motion with even and odd harmonics, as next to bumpers; its true swing by a fine grid."""
+    orders, sizes = np.arange(1, 8), 2.3e-3 / np.arange(1, 8) ** 2.5
+
+    def motion(phase: np.ndarray) -> np.ndarray:
+        angles = np.outer(2 * np.pi * phase, orders) + 0.4 * orders**2
+        return np.asarray(np.sin(angles) @ sizes)
+
+    true = 0.5 * np.ptp(motion(np.arange(200_000) / 200_000))
+    errors = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        phase = rng.random() + np.arange(round(cycles * 2000 / 3.37)) * 3.37 / 2000
+        u = motion(phase) + noise_m * rng.standard_normal(phase.size)
+        errors.append(mean_swing(u, phase) - true)
+    assert abs(np.mean(errors)) < 2e-6
+    assert np.abs(errors).max() < max(1e-7, 0.25 * noise_m)
+
+
 # In the conductor
 
 
