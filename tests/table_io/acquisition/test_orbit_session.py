@@ -13,6 +13,7 @@ import pytest
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.acquisition.session import OperatorCommand
 from table_io.block import Block
+from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.orbit_feedback import advance_feedback
@@ -126,19 +127,36 @@ def measure_peak_acceleration(command_m: np.ndarray) -> float:
     return float(np.abs(acceleration).max())
 
 
-def test_command_stays_below_the_peak_that_the_check_states_and_ends_at_rest(
-    held: PlayedSession,
-) -> None:
+def find_stated_peak(held: PlayedSession) -> float:
+    """Return the peak of the command in m/s2 that the check states, corrected as it was played."""
     profile = make_profile()
     drive = procedure.nominal_drive(procedure.make_test_plan(profile, RIG, 40))
     stated = max(row.acceleration_m_s2 for row in compute_demands(drive, profile, RIG))
+    assert stated < 1.6 * 0.49033
     correction = max(
         p.command_m * (math.tau * p.frequency_hz) ** 2 for p in held.select(OrbitPoint)
     )
-    peak = measure_peak_acceleration(held.command_m)
-    assert 1.1 * 0.49 < peak < stated * correction / 0.49033
-    assert stated < 1.6 * 0.49033
+    return stated * correction / 0.49033
+
+
+def test_command_stays_below_the_peak_that_the_check_states_and_ends_at_rest(
+    held: PlayedSession,
+) -> None:
+    assert 1.1 * 0.49 < measure_peak_acceleration(held.command_m) < find_stated_peak(held)
     assert np.abs(held.command_m[-200:]).max() < 1e-6
+
+
+def test_stop_at_any_moment_of_hold_and_release_stays_below_the_stated_peak(
+    held: PlayedSession,
+) -> None:
+    """A stop multiplies the command by a decay over two cycles at least, within releases too."""
+    stated, worst = find_stated_peak(held), 0.0
+    x = np.arange(3000) / 1400.0  # two cycles at 2.87 Hz
+    decay = 1.0 - smoothstep(x)
+    for at in range(round(20.0 * RATE_HZ), held.command_m.size - 5000, 211):
+        part = held.command_m[at - 300 : at + 3000] * np.append(np.ones(300), decay)
+        worst = max(worst, measure_peak_acceleration(part))
+    assert 1.1 * 0.49 < worst < stated
 
 
 def test_run_is_reproduced_to_the_bit(held: PlayedSession) -> None:
