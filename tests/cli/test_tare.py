@@ -13,10 +13,13 @@ import pytest
 
 from table_io.clock import local_datetime
 from table_io.config.base import PROFILES_DIR, load_config
+from table_io.config.rig_file import tares_dir
 from table_io.config.tare import TareFile
 from table_io.errors import InputError
 from tests.command_line import call_main
 from twin.api import TareOptions, check_test, run_simulated, tare
+from twin.campaign.config import CampaignPlan, read_plan
+from twin.campaign.state import OperatorAnswer, begin_campaign, require_unchanged
 from twin.results.contracts import RunSummary
 from twin.setup.run_config import read_run_config
 
@@ -172,3 +175,31 @@ def test_tare_command_prints_each_sensor_and_refuses_a_rig_that_is_shipped(
     shipped = call_main("tare", "--table", "simulated", "--yes")
     assert shipped.returncode == 2
     assert "comes with shaketwin" in shipped.stderr
+
+
+def test_campaign_refuses_without_a_tare_and_each_run_takes_the_newest(rig_file: Path) -> None:
+    """A tare at the prompt before a run is in the configuration of its recording."""
+    folder = rig_file.parent
+    write_test(folder, -1.0)
+    campaign = folder / "campaign.toml"
+    campaign.write_text('title = "C"\n[[runs]]\nprofile = "g-1.toml"\n', encoding="utf-8")
+
+    def read() -> CampaignPlan:
+        return read_plan(campaign, None, None, lambda bundle, path: None)
+
+    with pytest.raises(InputError, match="no tare with its bumpers clear"):
+        read()
+    take_tare(rig_file)
+    plan = read()
+    (folder / "runs").mkdir()
+    active = begin_campaign(folder / "runs", plan)
+    later = tare(TareOptions(str(rig_file), 23.5, tares_dir(rig_file) / "later.toml"), str)
+    text = later.path.read_text(encoding="utf-8")
+    at = (local_datetime() + timedelta(minutes=2)).isoformat(timespec="seconds")
+    text = re.sub(r"^sha256.*\n", "", text.replace(later.record.at, at), flags=re.M)
+    later.path.write_text(text, encoding="utf-8")
+    answer = OperatorAnswer(asked="", answer="done", who="", at="")
+    config = active.begin_recording(plan.runs[0], answer, "")
+    assert f'at = "{at}"' in config.rig_toml
+    assert config.rig_toml.count("[tare]") == 1
+    assert require_unchanged(folder / "runs", read())  # a warning, no refusal
