@@ -34,7 +34,7 @@ def play_component_test(preload: float, last_share: float) -> PreparedLog:
     return PreparedLog(build_signals((block,), "component", 1.0, (np.inf, np.inf)), 1.0)
 
 
-@pytest.mark.parametrize(("preload", "last_share"), [(0.0, 1.0), (40.0, 1.0), (40.0, 0.3)])
+@pytest.mark.parametrize(("preload", "last_share"), [(0.0, 1.0), (40.0, 0.3)])
 def test_friction_is_found_beside_a_force_at_rest_and_a_falling_amplitude(
     preload: float, last_share: float
 ) -> None:
