@@ -1,8 +1,11 @@
 """Blocks cut again, to prove that no result depends on the division of samples."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 from table_io.block import Block, join_blocks
+from table_io.records import Record
+
+Item = Block | Record
 
 
 def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
@@ -19,3 +22,13 @@ def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
             pending = [joined.cut(joined.index + samples, joined.end)] if pending_samples else []
     if pending_samples:
         yield join_blocks(pending)
+
+
+def drop_measured(items: Iterable[Item], first: int, end: int) -> Iterator[Item]:
+    """Yield items without the measured samples `first` up to `end`, which is not among them."""
+    for item in items:
+        if isinstance(item, Block) and item.stream == "meas":
+            spans = (item.index, min(first, item.end)), (max(end, item.index), item.end)
+            yield from (item.cut(*span) for span in spans if span[0] < span[1])
+        else:
+            yield item

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from table_io.block import Block
+from tests.builders.blocks import recut_blocks
 
 if TYPE_CHECKING:
     from twin.recording.columns import StoredItems
@@ -49,12 +50,24 @@ def bundle(tmp_path_factory: pytest.TempPathFactory) -> "RunConfig":
 
 @pytest.fixture(scope="session")
 def log_file(bundle: "RunConfig", tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The recording of a run of it, alone in its folder."""
+    """The recording of a run of it, alone in its folder, in the short blocks of a live run."""
+    from twin.recording.mcap_log import write_items
+    from twin.recording.reader import read_recording
     from twin.setup.unpaced import play_unpaced
 
-    path = tmp_path_factory.mktemp("across") / "first" / "run.mcap"
+    folder = tmp_path_factory.mktemp("across")
+    play_unpaced(bundle, "first", folder / "long.mcap", lambda: None, lambda _: None)
+    recording = read_recording(folder / "long.mcap")
+    samples = bundle.profile.acquisition.block_samples
+    blocks = [
+        block
+        for stream in ("meas", "pred")
+        for block in recut_blocks(recording.contiguous_blocks(stream), samples)
+    ]
+    path = folder / "first" / "run.mcap"
     path.parent.mkdir()
-    play_unpaced(bundle, "first", path, lambda: None, lambda _: None)
+    items = sorted([*recording.items.records, *blocks], key=lambda item: item.index)
+    write_items(path, items, recording.start)
     return path
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from table_io.block import Block, Label
+from table_io.block import Label
 from table_io.records import (
     Comparison,
     CycleExtremes,
@@ -24,6 +24,7 @@ from table_io.records import (
     SampleGap,
     Timing,
 )
+from tests.builders.blocks import drop_measured
 from twin.compare import COMPARED_CHANNELS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
@@ -301,7 +302,8 @@ def test_a_stopped_run_without_a_point(bundle: RunConfig, tmp_path: Path) -> Non
 def test_a_recording_without_an_end_says_so(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    kept = [item for item in without(recording, RunStop) if item.index < 3000]
+    begun = drop_measured(without(recording, RunStop), 3000, 2**62)
+    kept = [item for item in begun if item.index < 3000]
     summary = summary_of(kept, recording, bundle, tmp_path)
     assert summary["verdict"] == "halted"
     assert summary["reason"] == "the recording ends without a stop record"
@@ -327,11 +329,7 @@ def test_gaps_and_lost_samples_are_counted(
         SampleGap(2000, 2, "", "clipped"),
     ]
     assert summary_of([*recording.items, *gaps], recording, bundle, tmp_path)["gaps"] == 2
-    kept = [
-        item
-        for item in recording.items
-        if not (isinstance(item, Block) and item.stream == "meas" and 1500 <= item.index < 1600)
-    ]
+    kept = list(drop_measured(recording.items, 1500, 1600))
     (tmp_path / "holed").mkdir()
     summary = summary_of(kept, recording, bundle, tmp_path / "holed")
     assert summary["gaps"] == 1
