@@ -12,6 +12,7 @@ from table_io.config.excitation import History
 from table_io.config.profile import Specimen, load_profile
 from table_io.config.provenance import HashedFile, Provenance
 from table_io.config.rig import RigConfig
+from table_io.config.sealed_text import seal_text
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import list_setup_warnings
@@ -138,10 +139,25 @@ def test_files_without_provenance_are_used_with_a_warning(tmp_path: Path) -> Non
     assert "does not say which rig" in drive.notes[0]
     written = drive.save(tmp_path / "out")
     file = tmp_path / "out" / "drive.csv"
-    file.write_text(re.sub(r"# \[provenance\]\n(#.*\n)*", "", file.read_text()))
+    text = re.sub(r"# \[provenance\]\n(#.*\n)*", "", file.read_text())
+    file.write_text(text[: text.index("# The last line")])
     warnings = list_setup_warnings(read_run_config(written).profile, parse_rig())
     assert len(warnings) == 1
     assert "does not say which rig" in warnings[0]
+
+
+def test_altered_drive_and_altered_twin_are_refused(drive: DriveResult, tmp_path: Path) -> None:
+    written = drive.save(tmp_path / "out")
+    file = tmp_path / "out" / "drive.csv"
+    lines = file.read_text().splitlines()
+    lines[len(lines) // 2] = f"{float(lines[len(lines) // 2]) + 1e-3:.6f}"
+    file.write_text("\n".join([*lines, ""]))
+    with pytest.raises(InputError, match=r"drive\.csv was altered after it was written"):
+        read_run_config(written)
+    twin = tmp_path / "twin.toml"
+    twin.write_text(seal_text(TWIN).replace("residual = 0.0", "residual = 0.1", 1))
+    with pytest.raises(InputError, match=r"twin\.toml: the twin of the table was altered"):
+        load_table_twin(twin)
 
 
 @pytest.mark.parametrize(

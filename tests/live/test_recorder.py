@@ -298,3 +298,28 @@ def test_failed_sync_is_not_cleared_by_a_later_one(
     assert len(read_event_texts(bus, "disk")) == 1
     assert "Input/output error" in read_event_texts(bus, "disk")[0]
     assert len(bus.orders) == 1
+
+
+@pytest.mark.parametrize("loss", ["deleted", "moved"])
+def test_recording_that_is_taken_away_stops_the_table_and_is_written_again(
+    tmp_path: Path, limit: Callable[[int], None], loss: str
+) -> None:
+    recorder, bus = at_work(tmp_path)
+    bus.answers.append(None)  # the first order is not heard
+    part = tmp_path / "part.mcap"
+
+    def take_away(turn: int) -> None:
+        if turn == 100 and loss == "deleted":
+            part.unlink()
+        elif turn == 100:
+            part.rename(tmp_path / "elsewhere.mcap")
+
+    bus.each_turn = take_away
+    recorder.run()
+    recorder.finish()
+    reason = f"the recording in {tmp_path.parent} was deleted or moved"
+    assert bus.orders == [f"stop {START.run}\n{reason} 0.5"] * 2
+    lost, restored = read_event_texts(bus, "disk")
+    assert lost.startswith(reason)
+    assert "whole again" in restored
+    assert list_recorded(tmp_path) == list_expected()

@@ -12,6 +12,7 @@ from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, loa
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.profile import Profile
 from table_io.config.provenance import Provenance
+from table_io.config.sealed_text import require_seal, seal_text
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 from twin.earthquakes.table_effects import EFFECT_BY_ID, EffectDiscovery
@@ -180,7 +181,12 @@ class TableTwinConfig(ConfigModel):
 
 def load_table_twin(path: Path) -> TableTwinConfig:
     """Load the twin of a table from its file; InputError if it is none."""
-    return load_config(path, TableTwinConfig, "table twin")[0]
+    config, text = load_config(path, TableTwinConfig, "table twin")
+    try:
+        require_seal(text, "the twin of the table", "identify it again by `shaketwin table-twin`")
+    except InputError as error:
+        raise error.add_place(path) from None
+    return config
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,7 +239,7 @@ class TableTwinResult:
             raise InputError(reason, where=path)
         if path.exists():
             raise InputError("exists already", where=path, remedy="give a new name")
-        path.write_text(self.format_toml(), encoding="utf-8")
+        path.write_text(seal_text(self.format_toml()), encoding="utf-8")
         return path
 
 

@@ -14,6 +14,7 @@ from pydantic import Field
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, parse_toml
 from table_io.config.provenance import Provenance
+from table_io.config.sealed_text import require_seal, seal_text
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 
@@ -40,7 +41,7 @@ def format_drive(
     lines += [f"# target_{name}_mm = {1e3 * size:.9g}" for name, size in _measure(target_m).items()]
     header = format_toml({"provenance": provenance.model_dump()})
     lines += [f"# {line}" for line in header.splitlines() if line]
-    return "\n".join([*lines, HEADER, *(f"{1e3 * value:.6f}" for value in command_m), ""])
+    return seal_text("\n".join([*lines, HEADER, *(f"{1e3 * value:.6f}" for value in command_m)]))
 
 
 def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
@@ -84,6 +85,10 @@ def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
                 key=DRIVE_KEY,
                 remedy=DRIVE_REMEDY,
             )
+    try:
+        require_seal(text, name, DRIVE_REMEDY)
+    except InputError as error:
+        raise error.replace(key=DRIVE_KEY) from None
     return command
 
 
