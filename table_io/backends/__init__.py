@@ -40,6 +40,10 @@ rig has died if no sign of life arrives for HEARTBEAT_TIMEOUT_S between start an
 continues alone, to rest. Every call is a sign of life, and a call that waits sends more while it
 waits. If the rig was only slow, its next call raises MachineLost.
 
+Back in time. A table that is simulated in this process may have `take_back()`: what it returns
+restores the present sample, with the command that is queued then. An unpaced session acquires many
+blocks at once there, and goes back if one of them needs an answer.
+
 `tests/table_io/backends/conformance.py` tests every backend against each clause.
 
 A module makes a backend known by a `BackendDescriptor`, registered under the backend's name in the

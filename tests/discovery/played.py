@@ -5,15 +5,12 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from table_io.acquisition.session import SessionSetup, run_session
-from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from table_io.clock import ManualClock
 from table_io.config.profile import Profile
-from table_io.records import RunStart
 from table_io.sim.config import SimulatedTableConfig
 from tests.builders.rigs import RIG
+from tests.builders.sessions import play_session
 from tests.builders.truths import seal_truth
 from twin.discovery.discover import PreparedLog, PreparedProblem
 from twin.discovery.parameters import NuisanceKey
@@ -55,18 +52,7 @@ def blocks(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> tuple[Bl
         if truth:
             simulated = simulated.model_copy(update=seal_truth(Path(folder), truth))
         rig = RIG.model_copy(update={"sensors": tuple(sensors), "simulated": simulated})
-        clock, test = ManualClock(), profile(gap_mm)
-
-        def start(tare: dict[str, float], epoch_s: float) -> RunStart:
-            return RunStart(
-                0, "r", "n", "table", "", "", "", 1e3, 20, rig.channels, (), 0, tare, {}, "", "",
-                epoch_s,
-            )  # fmt: skip
-
-        source = run_session(
-            SessionSetup(test, rig), open_backend(rig, test, clock), clock, start, lambda: None
-        )
-        return tuple(item for item in source if isinstance(item, Block))
+        return tuple(play_session(profile(gap_mm), rig=rig, joins_blocks=True).select(Block))
 
 
 def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog:
