@@ -193,7 +193,9 @@ def test_campaign_refuses_without_a_tare_and_each_run_takes_the_newest(rig_file:
     plan = read()
     (folder / "runs").mkdir()
     active = begin_campaign(folder / "runs", plan)
-    later = tare(TareOptions(str(rig_file), 23.5, tares_dir(rig_file) / "later.toml"), str)
+    later = tare(
+        TareOptions(str(rig_file), 23.5, tares_dir(rig_file) / "later.toml"), lambda _: None
+    )
     text = later.path.read_text(encoding="utf-8")
     at = (local_datetime() + timedelta(minutes=2)).isoformat(timespec="seconds")
     text = re.sub(r"^sha256.*\n", "", text.replace(later.record.at, at), flags=re.M)

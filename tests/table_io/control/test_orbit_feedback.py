@@ -99,7 +99,7 @@ def test_acceleration_of_the_written_correction_is_limited_in_any_ramp_of_the_sh
             replace(state.segments[0], start=start, count=count, share0=before, share1=after)
         )
     deviation = sine(3e-4) + 5e-6 * rng.standard_normal(2000)
-    drives = []
+    drives: list[Drive] = []
     for end in range(BLOCK, 2000, BLOCK):
         state, drive = run_feedback_block(
             state, drives[-1] if drives else make_drive(), deviation, end
