@@ -288,7 +288,7 @@ def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
         return max(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
 
     faults = [
-        f"noise of {name} is {value:.3g} {unit}, allowed "
+        f"noise of {name} is {value:.3g} {unit} +-{KNOWN_MARGIN_DB:g} dB by the rig file, allowed "
         + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
         + f" {unit}"
         for name, value, low, high, unit in list_noise_margins(
