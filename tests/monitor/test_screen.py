@@ -43,7 +43,7 @@ watched  Simulated uni-axial shaking table                           ● running
 step  4/10   3.500 Hz ↑ forward  ━━━━━━───────────────────────────────────────  13 %  0:00:52 left
 Level ──────────────────────────────────────────  PRC η_d ━ forward ━ backward ○ twin ────────────
 demanded    0.0500 g  command × 1.034             0.2┤                                ⢸
-now         0.0500 g  +0.02 %                        │                                ⢸
+now         0.0500 g  +0.02 %  peak 0.0500 g         │                                ⢸
 accepted, corrected 2 ×, thd 4.6 %                   │                      ○         ⢸
                                                      │                 ⣀⠤⠔⠒⠉          ⢸
 Margins to limits, peak of 1 s ─────────────────     │           ⢀⣀⠤⠔⠊⠉               ⢸
@@ -85,7 +85,7 @@ watched                        ● running, measuring  0:00:08
 step  4/10   3.500 Hz ↑ forward  ━──────  13 %  0:00:52 left
 Level ──────────────────────────────────────────────────────
 demanded    0.0500 g  command × 1.034
-now         0.0500 g  +0.02 %
+now         0.0500 g  +0.02 %  peak 0.0500 g
 accepted, corrected 2 ×, thd 4.6 %
 PRC η_d ━ forward ━ backward ○ twin ────────────────────────
 0.2┤                                         ⢸

@@ -32,6 +32,7 @@ BLANK_BRAILLE = 0x2800
 AXIS_STYLE = "grey50"
 MAX_DOT = 1e4  # dots: points farther out are clipped
 MIN_MARK_SPACING = 3  # cells between the marks of a curve
+WIDE_LEVEL = 46  # cells of a column, from which the peak of the table fits next to its fundamental
 LEVEL_STYLES = {"INFO": "", "WARN": WARN_STYLE, "ERROR": BAD_STYLE}
 
 
@@ -62,7 +63,7 @@ def draw_level(view: RunView, width: int, height: int) -> list[Text]:
     else:
         lines[1].append(f"{level.current_g:8.4f} g")
         lines[1].append(f"  {100 * level.deviation:+.2f} %", STYLES[level.tone])
-        if level.peak_g is not None:
+        if level.peak_g is not None and width >= WIDE_LEVEL:
             lines[1].append(f"  peak {level.peak_g:.4f} g", DIM_STYLE)
     if level.correction is not None and level.thd is not None:
         lines[0].append(f"  command × {level.correction:.3f}", DIM_STYLE)
