@@ -26,6 +26,7 @@ from table_io.acquisition.drive_follower import (
     take_drive_indices,
 )
 from table_io.acquisition.session import (
+    ACCEPTED,
     CLIP_RATIO,
     TARE_S,
     CommandSource,
@@ -409,12 +410,15 @@ class _ExternalSession:
 
     def execute(self, command: OperatorCommand | None) -> None:
         """Log that the table cannot be controlled from here; a stop ends the recording."""
-        if command is None or self._stop_deadline is not None:
+        if command is None:
             return
         if command.name in ("hold", "resume"):
-            self.event_log.add_event(
-                "refused", f"{command.name} is not possible from here: use the external controller"
-            )
+            refusal = f"{command.name} is not possible from here: use the external controller"
+            self.event_log.add_event("refused", refusal)
+            command.answer(f"refused: {refusal}")
+            return
+        command.answer(ACCEPTED)
+        if self._stop_deadline is not None:
             return
         self.verdict = "stopped" if command.name == "stop" else "aborted"
         self.reason = command.reason

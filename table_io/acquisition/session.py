@@ -83,12 +83,17 @@ class SessionSetup:
     preload_n: PreloadLimits | None = None
 
 
+ACCEPTED = "yes"
+
+
 @dataclass(frozen=True, slots=True)
 class OperatorCommand:
     """Command of the operator, or of a process on the operator's behalf, to a session."""
 
     name: str  # hold, resume, stop, abort
     reason: str
+    # Takes `ACCEPTED`, or why the command is refused, once the session has decided.
+    answer: Callable[[str], None] = field(default=lambda _: None, compare=False)
 
 
 @dataclass(slots=True)
@@ -322,12 +327,21 @@ class _Session:
         return self._state, ()
 
     def execute(self, command: OperatorCommand | None) -> None:
-        """Execute an operator command if the state allows it."""
-        if command is None or self.output_queue.is_decaying:
-            return
-        if command.name in ("stop", "abort"):
+        """Execute an operator command if the state allows it, and answer it."""
+        if command is not None:
+            refusal = self._execute(command)
+            command.answer(f"refused: {refusal}" if refusal else ACCEPTED)
+
+    def _execute(self, command: OperatorCommand) -> str:
+        """Execute a command; return why it is refused, "" if it is not."""
+        is_stop = command.name in ("stop", "abort")
+        if self.output_queue.is_decaying:
+            return (
+                "" if is_stop else f"{command.name} is not possible while the table comes to rest"
+            )
+        if is_stop:
             self.stop("stopped" if command.name == "stop" else "aborted", command.reason)
-            return
+            return ""
         previous, index = (
             self._state,
             self.output_queue.first_changeable() + round(COMMAND_DELAY_S * self.rate_hz),
@@ -335,12 +349,12 @@ class _Session:
         change = {"hold": procedure.hold_test, "resume": procedure.resume_test}[command.name]
         self._state = change(previous, index)
         if self._state is previous:
-            self.event_log.add_event(
-                "refused", f"{command.name} is not possible in state {self.event_log.states[-1]!r}"
-            )
-            return
+            refusal = f"{command.name} is not possible in state {self.event_log.states[-1]!r}"
+            self.event_log.add_event("refused", refusal)
+            return refusal
         self.output_queue.change_drive(self._state.drive, self._state.changed_from)
         self.event_log.enter_state("holding" if command.name == "hold" else "running")
+        return ""
 
     def stop(self, verdict: str, reason: str) -> None:
         """Stop the test: start the final decay to rest."""

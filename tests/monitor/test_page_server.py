@@ -9,6 +9,7 @@ import stat
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
@@ -308,11 +309,34 @@ def test_the_number_of_streams_and_of_connections_is_limited(
     monkeypatch.setattr(page_server, "MAX_CONNECTIONS", 4)
     with serving() as page:
         assert [page.get("/events").status for _ in range(3)] == [200, 200, 503]
-        idle = 0
-        while is_served_soon(page):
-            page.open.enter_context(socket.create_connection(("127.0.0.1", page.port)))
-            idle += 1
-        assert idle >= 2
+    monkeypatch.setattr(page_server, "MAX_STREAMS", 5)
+    with serving() as page:
+        assert [page.get("/events").status for _ in range(4)] == [200] * 4
+        assert not is_served(page)
+
+
+def test_silent_connections_shut_nobody_out(page: Served) -> None:
+    for _ in range(150):
+        page.open.enter_context(socket.create_connection(("127.0.0.1", page.port)))
+    started_s = time.monotonic()
+    assert page.get("/").status == 200
+    assert time.monotonic() - started_s < 0.5
+
+
+def test_wrong_code_is_logged_and_slowed_and_a_right_one_is_not(
+    lab: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_server, "WRONG_CODE_S", 0.4)
+    with serving(own(lab, "anna")) as page, ThreadPoolExecutor(3) as threads:
+        started_s = time.monotonic()
+        wrong = [threads.submit(page.get, "/events", **as_person("aaaa-bbbb")) for _ in range(3)]
+        assert page.get("/events", **as_person(page.server.access.code)).status == 200
+        assert page.get("/events").status == 401  # without a code: the page before the login
+        assert time.monotonic() - started_s < 0.35
+        assert [answer.result().status for answer in wrong] == [401] * 3
+        assert time.monotonic() - started_s >= 3 * 0.4
+    assert caplog.text.count("wrong access code from 127.0.0.1") == 3
+    assert "aaaa" not in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,11 @@ from twin.transport.codec import Item
 
 
 def _send(**message: str | int | bool) -> None:
-    print(json.dumps(message), flush=True)
+    """Print a message; without a parent that reads it, this and all later ones go nowhere."""
+    try:
+        print(json.dumps(message), flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def run_worker() -> None:

@@ -15,7 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from table_io.acquisition.external_control import record_external
-from table_io.acquisition.session import COMMAND_NAMES, LatenessLog, OperatorCommand, run_session
+from table_io.acquisition.session import (
+    ACCEPTED,
+    COMMAND_NAMES,
+    LatenessLog,
+    OperatorCommand,
+    run_session,
+)
 from table_io.backends import open_backend, open_source
 from table_io.block import Block
 from table_io.clock import RealClock
@@ -63,7 +69,9 @@ def run_rig(config: ProcessConfig, _: str) -> None:
         link.declare_commands(), config.run, run_config.profile.on_death.supervisor == "stop"
     )
     link.declare_alive(process_token(config, "rig"))
-    while (command := commands.poll_request()) is None or command[0] != "start":
+    while (command := commands.poll_request()) is None or command.name != "start":
+        if command is not None:
+            command.answer("refused: the test has not begun")
         if is_orphaned():
             return
         clock.wait_until(clock.now() + 0.01)
@@ -95,28 +103,37 @@ def run_rig(config: ProcessConfig, _: str) -> None:
 
 @dataclass(slots=True)
 class _CommandQueue:
-    """Commands to the rig of a run; each is answered at once."""
+    """Commands to the rig of a run; one to the session is answered once it is executed."""
 
     requests: RequestQueue
     run: str
     stop_if_orphaned: bool
 
-    def poll_request(self) -> tuple[str, str] | None:
-        """Return (name, reason) of the next command; one for another run is refused."""
+    def poll_request(self) -> OperatorCommand | None:
+        """Return the next command, or "start"; one for another run is refused."""
         request = self.requests.poll()
         if request is None:
             return None
         run, _, reason = request.text.partition("\n")
-        accepted = run == self.run and request.name in ("start", *COMMAND_NAMES)
-        log.info("command %s, %s", request.name, "accepted" if accepted else "refused")
-        request.reply("yes" if accepted else f"refused: this is run {self.run}")
-        return (request.name, reason) if accepted else None
+        if run != self.run or request.name not in ("start", *COMMAND_NAMES):
+            log.info("command %s, refused", request.name)
+            request.reply(f"refused: this is run {self.run}")
+            return None
+
+        def answer(text: str) -> None:
+            log.info("command %s: %s", request.name, text)
+            request.reply(text)
+
+        command = OperatorCommand(request.name, reason or f"asked to {request.name}", answer)
+        if command.name == "start":
+            answer(ACCEPTED)
+        return command
 
     def poll_command(self) -> OperatorCommand | None:
         """Return the next command to the session; stop if orphaned and so configured."""
         command = self.poll_request()
-        if command is not None and command[0] in COMMAND_NAMES:
-            return OperatorCommand(command[0], command[1] or f"asked to {command[0]}")
+        if command is not None and command.name in COMMAND_NAMES:
+            return command
         must_stop = self.stop_if_orphaned and is_orphaned()
         return OperatorCommand("stop", "the supervisor is gone") if must_stop else None
 

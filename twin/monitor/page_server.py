@@ -14,6 +14,7 @@ import ssl
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from http.client import HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -36,6 +37,8 @@ CLIENT_TIMEOUT_S = 5.0  # for a whole request, and for taking what is sent
 MAX_REQUEST_BYTES = 2**16  # with its headers
 SEND_BUFFER_BYTES = 2**16  # in the kernel, of one client
 MAX_BODY_BYTES = 1024
+DROP_TIMEOUT_S = 0.5  # for the place of a silent connection
+WRONG_CODE_S = 1.0  # between answers to wrong codes from one address
 POLL_S = 0.1  # within which the server ends
 HEARTBEAT_S = 2.0  # between messages to a client when nothing changes
 HEADERS = {
@@ -105,6 +108,7 @@ class PageServer(ThreadingHTTPServer):
     """Server of one page at (host, port) for a limited number of clients."""
 
     daemon_threads = True
+    request_queue_size = 2 * MAX_CONNECTIONS
 
     def __init__(
         self,
@@ -120,7 +124,10 @@ class PageServer(ThreadingHTTPServer):
         # One command of a person at a time: no other person's command waits for it.
         self.command_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self.streams = threading.BoundedSemaphore(MAX_STREAMS)
+        # By address: one wrong code at a time, whatever the number of connections.
+        self.code_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
         self._connections = threading.BoundedSemaphore(MAX_CONNECTIONS)
+        self._silent: dict[Any, socket.socket] = {}  # without a request so far, oldest first
         super().__init__((host.strip("[]"), port), PageRequest)
 
     def server_bind(self) -> None:
@@ -131,18 +138,33 @@ class PageServer(ThreadingHTTPServer):
         self.server_name, self.server_port = str(self.server_address[0]), self.server_address[1]
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        """Serve a connection in a thread, or close it at once if there are too many."""
+        """Serve a connection in a thread; of too many, the oldest that is silent is closed."""
         if not self._connections.acquire(blocking=False):
-            log.info("connection refused: %d are open", MAX_CONNECTIONS)
-            self.shutdown_request(request)
-            return
+            self._drop_silent()
+            if not self._connections.acquire(timeout=DROP_TIMEOUT_S):
+                log.info("connection refused: %d are open", MAX_CONNECTIONS)
+                self.shutdown_request(request)
+                return
+        self._silent[client_address] = request
         super().process_request(request, client_address)
+
+    def _drop_silent(self) -> None:
+        """Close the oldest connection on which no request has come, which ends its thread."""
+        for client_address in [*self._silent][:1]:
+            log.info("connection from %s closed: silent, and too many are open", client_address)
+            with suppress(OSError, KeyError):
+                self._silent.pop(client_address).shutdown(socket.SHUT_RDWR)
+
+    def note_request(self, client_address: Any) -> None:
+        """Take a connection from the silent ones."""
+        self._silent.pop(client_address, None)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         """Serve a connection and release its place."""
         try:
             super().process_request_thread(request, client_address)
         finally:
+            self.note_request(client_address)
             self._connections.release()
 
     def finish_request(self, request: Any, client_address: Any) -> None:
@@ -197,6 +219,12 @@ class PageRequest(BaseHTTPRequestHandler):
         super().setup()
         self.rfile = io.BufferedReader(RequestReader(self.connection))
 
+    def parse_request(self) -> bool:
+        """Parse the request, which takes the connection from the silent ones."""
+        is_request = super().parse_request()
+        self.server.note_request(self.client_address)
+        return is_request
+
     def do_GET(self) -> None:
         """Send a file of the page, or the stream of events."""
         if not self._check_host():
@@ -240,9 +268,15 @@ class PageRequest(BaseHTTPRequestHandler):
         return False
 
     def _identify(self) -> str:
-        """Return the name of the user, or "" after a refusal."""
+        """Return the name of the user, or "" after a refusal; a wrong code is logged and slowed."""
         user = self.server.access.identify(self._code)
         if not user:
+            if self._code:
+                host = str(self.client_address[0])
+                log.warning("wrong access code from %s", host)
+                with self.server.code_locks[host]:
+                    clock = RealClock()
+                    clock.wait_until(clock.now() + WRONG_CODE_S)
             self._reply_message(401, "log in with your access code")
         return user
 

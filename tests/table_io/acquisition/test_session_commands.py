@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from table_io.acquisition.output_queue import DECISION_S, OutputQueue
 from table_io.acquisition.session import (
+    ACCEPTED,
     COMMAND_DELAY_S,
     MAX_LATENESS_S,
     OperatorCommand,
@@ -60,11 +61,13 @@ class Orders:
 
     orders: dict[int, str]
     asked: int = 0
+    answers: list[str] = field(default_factory=list)
 
     def __call__(self) -> OperatorCommand | None:
         self.asked += 1
         name = self.orders.get(self.asked)
-        return OperatorCommand(name, f"ordered {name} after {self.asked}") if name else None
+        reason = f"ordered {name} after {self.asked}"
+        return OperatorCommand(name, reason, self.answers.append) if name else None
 
 
 @dataclass
@@ -87,11 +90,13 @@ def changes(monkeypatch: pytest.MonkeyPatch) -> Changes:
     return record
 
 
-def give(orders: dict[int, str], subject: Machine | None = None) -> list[Block | Record]:
+def give(orders: dict[int, str] | Orders, subject: Machine | None = None) -> list[Block | Record]:
     """Return the items of a session with these orders."""
     subject = subject or machine()
-    subject.stopping |= bool({"hold", "resume"} & set(orders.values()))  # the drive changes
-    return list(session(subject, Orders(orders)))
+    given_orders = orders if isinstance(orders, Orders) else Orders(orders)
+    names = {*given_orders.orders.values()}
+    subject.stopping |= bool({"hold", "resume"} & names)  # the drive changes
+    return list(session(subject, given_orders))
 
 
 def events(items: Iterable[Block | Record], kind: str) -> list[Event]:
@@ -192,12 +197,24 @@ def test_order_takes_effect_with_its_lead(after: int, wait: int, changes: Change
 def test_order_out_of_place_is_refused_and_changes_nothing(
     orders: dict[int, str], refused: list[str], changes: Changes
 ) -> None:
-    items = give(orders)
-    assert [
-        event.text.replace(" is not possible in state", " in") for event in events(items, "refused")
-    ] == refused
+    operator = Orders(orders)
+    items = give(operator)
+    texts = [event.text for event in events(items, "refused")]
+    assert [text.replace(" is not possible in state", " in") for text in texts] == refused
+    # Every order is answered by what became of it.
+    refusals = [answer for answer in operator.answers if answer != ACCEPTED]
+    assert refusals == [f"refused: {text}" for text in texts]
+    assert len(operator.answers) == len(orders)
     assert len(changes.made) == len(orders) - len(refused)
     assert stop_record(items).verdict == "complete"
+
+
+def test_order_during_the_decay_is_answered() -> None:
+    operator = Orders({300: "stop", 305: "hold", 306: "stop"})
+    give(operator)
+    assert operator.answers == [
+        ACCEPTED, "refused: hold is not possible while the table comes to rest", ACCEPTED,
+    ]  # fmt: skip
 
 
 def test_trip_during_a_decay_is_no_second_stop() -> None:
