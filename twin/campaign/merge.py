@@ -85,7 +85,8 @@ def merge_summaries(
                 (level.error_uncorrected for level in levels), key=abs, default=None
             ),
             "updates": max((level.updates for level in levels), default=0),
-            "checks": [check for summary in known for check in summary.checks],
+            # Each part begins with all checks: those of the last part that came so far.
+            "checks": next((each.checks for each in reversed(known) if each.checks), []),
             "trips": [trip for summary in known for trip in summary.trips],
             "faults": [fault for summary in known for fault in summary.faults],
             "latency_p99_ms": max((p99 for p99 in latencies if p99), default=None),
