@@ -69,6 +69,21 @@ LABS = {
     "no lasers' mate": Instruments(missing=("table_acc_m_s2",)),
     "all": Instruments(filter_share=0.25, hum=2.0, beat_hz=0.3, pink=1.0, plate_kg=1.0),
 }
+OTHER_LABS = {
+    "relative laser": Instruments(has_relative_laser=True),
+    "relative laser alone": Instruments(
+        has_relative_laser=True, missing=("table_disp_m", "mass_acc_m_s2")
+    ),
+    "no cells": Instruments(missing=("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")),
+    "one cell a side": Instruments(share=1.0, share_left=1.0, missing=("force_r2_n", "force_l2_n")),
+    "skew": Instruments(skew_s=1e-4, filter_share=0.2),
+    "14 bits": Instruments(bits=14),
+    "loud": Instruments(laser=5e-5, acc=0.05, cell=5.0),
+    "quiet": Instruments(laser=1e-6, acc=1e-3, cell=0.2),
+    "200 Hz": Instruments(filter_share=0.35),
+    "2000 Hz": Instruments(filter_share=0.2),
+    "4000 Hz": Instruments(),
+}
 GAPS = {"g0": 0.0, "gm1": -1.0, "g4": 4.0, "g10": 10.0, "free": 40.0}
 
 
@@ -82,6 +97,19 @@ def draw_clean_cases(seeds: range) -> Iterator[Case]:
             "clean", f"{gap} {lab}", seed, vary(Specimen(gap_mm=GAPS[gap]), rng), LABS[lab],
             _test(gap),
         )  # fmt: skip
+
+
+def draw_other_cases(seeds: range) -> Iterator[Case]:
+    """Clean recordings of laboratories of other kinds: channels, rates and converters."""
+    names = [(gap, lab) for gap in GAPS for lab in OTHER_LABS]
+    for seed in seeds:
+        gap, lab = names[(7 * seed) % len(names)]
+        rng = np.random.default_rng(5000 + seed)
+        test = _test(gap)
+        if lab.endswith("Hz"):
+            test = replace(test, rate_hz=float(lab.split()[0]))
+        specimen = vary(Specimen(gap_mm=GAPS[gap]), rng)
+        yield Case("other", f"{gap} {lab}", seed, specimen, OTHER_LABS[lab], test)
 
 
 EFFECTS: dict[str, tuple[str, dict[str, float]]] = {
@@ -150,6 +178,7 @@ def _test(gap: str) -> StepTest:
 GROUPS = {
     "component": draw_component_cases,
     "clean": draw_clean_cases,
+    "other": draw_other_cases,
     "effect": draw_effect_cases,
     "stranger": draw_stranger_cases,
 }
@@ -218,7 +247,7 @@ def judge(row: dict[str, object]) -> str:
     """Return right, wrong or half for what is said of a case."""
     verdict, effects = str(row["verdict"]), [str(e) for e in row.get("effects", [])]  # type: ignore[attr-defined]
     blamed = any(e.startswith(("sensor_", "mass_error")) for e in effects)
-    if row["group"] in ("component", "clean"):
+    if row["group"] in ("component", "clean", "other"):
         return "right" if verdict == "none" and not row.get("blamed") else "wrong"
     if row["group"] == "effect":
         if verdict == "named" and effects == [*row["truth"]]:  # type: ignore[misc]

@@ -143,6 +143,9 @@ class Instruments:
     beat_hz: float = 0.0
     pink: float = 0.0  # corner of 1/f noise in Hz
     plate_kg: float = 0.0
+    bits: int = 0  # of the converter, over the largest reading; 0 for a fine one
+    skew_s: float = 0.0  # between successive channels of a multiplexed logger
+    has_relative_laser: bool = False  # on the table: it reads the mass relative to that
     missing: tuple[str, ...] = ()
     rest_s: float = 2.0
     faults: Mapping[str, float] = field(default_factory=dict)  # gain of a channel
@@ -232,14 +235,22 @@ def record(
         "force_r2_n": (1 - lab.share) * right + 0.5 * plate,
         "force_l1_n": lab.share_left * left - 0.5 * plate,
         "force_l2_n": (1 - lab.share_left) * left - 0.5 * plate,
+        "rel_disp_m": out[0],
     }
     noise = {"disp": lab.laser, "acc": lab.acc, "r1": lab.cell, "r2": lab.cell, "l1": lab.cell,
              "l2": lab.cell}  # fmt: skip
     columns = {}
-    for name, values in true.items():
+    absent = {*lab.missing, "mass_disp_m" if lab.has_relative_laser else "rel_disp_m"}
+    for number, (name, values) in enumerate(true.items()):
         level = noise[name.split("_")[1]]
+        if lab.skew_s:
+            time = np.arange(values.size) / FINE_HZ
+            values = np.interp(time - number * lab.skew_s, time, values)
         read = _read(values, test.rate_hz, level, lab, rng, name)
-        if name not in lab.missing:
+        if lab.bits:
+            step = 2.0 * float(np.abs(read).max()) / 2**lab.bits
+            read = step * np.round(read / step)
+        if name not in absent:
             columns[name] = read
     size = min(values.size for values in columns.values())
     skip = 0 if lab.rest_s > 0 else round(0.6 * test.rate_hz)
