@@ -80,7 +80,7 @@ OTHER_LABS = {
     "14 bits": Instruments(bits=14),
     "loud": Instruments(laser=5e-5, acc=0.05, cell=5.0),
     "quiet": Instruments(laser=1e-6, acc=1e-3, cell=0.2),
-    "200 Hz": Instruments(filter_share=0.35),
+    "500 Hz": Instruments(filter_share=0.35),
     "2000 Hz": Instruments(filter_share=0.2),
     "4000 Hz": Instruments(),
 }
@@ -142,6 +142,22 @@ def draw_effect_cases(seeds: range) -> Iterator[Case]:
         )  # fmt: skip
 
 
+SMALL = ("cubic_stiffness", "coulomb_friction", "quadratic_damping", "bumper_hardening")
+
+
+def draw_small_cases(seeds: range) -> Iterator[Case]:
+    """One effect, from far below the noise to well above it: what `excludes` states must hold."""
+    for seed in seeds:
+        effect = SMALL[seed % len(SMALL)]
+        gap, hidden = EFFECTS[effect]
+        rng = np.random.default_rng(6000 + seed)
+        share = 10.0 ** rng.uniform(-3.0, -0.5)
+        scaled = {name: share * value for name, value in hidden.items()}
+        specimen = replace(vary(Specimen(gap_mm=GAPS[gap]), rng), hidden=scaled)
+        yield Case("small", f"{effect} {gap}", seed, specimen, LABS["plain"], _test(gap),
+                   truth=(effect,))  # fmt: skip
+
+
 STRANGERS: dict[str, tuple[str, str, dict[str, float]]] = {
     "soft layer": ("g4", "bumper", {"soft_depth": 4e-4, "soft_share": 0.3}),
     "flexible mount": ("g4", "bumper", {"mount_k": 1.5e6}),
@@ -180,6 +196,7 @@ GROUPS = {
     "clean": draw_clean_cases,
     "other": draw_other_cases,
     "effect": draw_effect_cases,
+    "small": draw_small_cases,
     "stranger": draw_stranger_cases,
 }
 
@@ -223,6 +240,8 @@ def play(case: Case) -> dict[str, object]:
             ],
             "confidence": round(verdict.confidence or 0.0, 3),
             "excludes": {size.id: size.force_share for size in verdict.excludes},
+            "bounds": {size.id: size.value for size in verdict.excludes},
+            "hidden": dict(s.hidden),
             "before": round(verdict.gap.held_out_before, 3),
             "after": round(verdict.gap.held_out_after, 3),
             "floor": round(verdict.gap.noise_floor, 3),
@@ -253,6 +272,14 @@ def judge(row: dict[str, object]) -> str:
         if verdict == "named" and effects == [*row["truth"]]:  # type: ignore[misc]
             return "right"
         return "open" if verdict in ("unexplained", "ambiguous") and not blamed else "wrong"
+    if row["group"] == "small":
+        if verdict == "named":
+            return "right" if effects == [*row["truth"]] else "wrong"  # type: ignore[misc]
+        (true,) = row["hidden"].values()  # type: ignore[attr-defined]
+        bound = row["bounds"].get(row["truth"][0], 0.0)  # type: ignore[attr-defined, index]
+        if verdict == "none":
+            return "none, bound holds" if abs(true) <= abs(bound) else "none, bound too small"
+        return "open"
     law = row.get("law")
     if verdict == "unexplained" and not blamed:
         return "right"
