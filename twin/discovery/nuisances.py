@@ -308,17 +308,28 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     square = -(signals.omega**2)
     if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
         spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
-    if {"table_acc_m_s2", "table_disp_m"} <= spectra.keys():
-        disp, acc = (signals.noise[name] for name in ("table_disp_m", "table_acc_m_s2"))
-        density = disp * acc / np.hypot(acc, square * disp) / math.sqrt(grid.decimation)
-        table = signals.fuse_body("table")
-        gain = _pass_motion(signals, grid.to_time_domain(table), density)
-        spectra["table_acc_m_s2"] = square * table * gain
+    if "table_acc_m_s2" in spectra:
+        spectra["table_acc_m_s2"] = _smooth_table_acc(signals)
     return replace(signals, spectra=spectra)
 
 
+def _smooth_table_acc(signals: LogSignals) -> Spectrum:
+    """Return the acceleration of the table in m/s2 from its sensors, less their noise."""
+    grid, square = signals.grid, -(signals.omega**2)
+    acc, s_a = signals.spectra["table_acc_m_s2"], signals.noise["table_acc_m_s2"]
+    density = s_a
+    if "table_disp_m" in signals.spectra:
+        # the mean of both, each weighted by the inverse of its variance
+        s_x = np.abs(square) * signals.noise["table_disp_m"]
+        variance = s_a**2 + s_x**2
+        acc = (s_a**2 * square * signals.spectra["table_disp_m"] + s_x**2 * acc) / variance
+        density = s_a * s_x / np.sqrt(variance)
+    density = density / math.sqrt(grid.decimation)
+    return acc * _pass_motion(signals, grid.to_time_domain(acc), density)
+
+
 def _pass_motion(signals: LogSignals, u: Float1D, density: Float1D) -> Float1D:
-    """Return the gain of a Wiener filter, (frequency,), of a displacement u in m, (sample,).
+    """Return the gain of a Wiener filter, (frequency,), of a motion u, (sample,).
 
     `density` is that of its noise, (frequency,), at the rate of u.
     """

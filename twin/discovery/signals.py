@@ -237,14 +237,6 @@ class LogSignals:
             spectra[channel] = self.spectra[channel] + density * (parts[0] + 1j * parts[1])
         return replace(self, spectra=spectra)
 
-    def fuse_body(self, body: str) -> Spectrum:
-        """Return the spectrum of the displacement of mass or table from both of its sensors."""
-        channels = next(pair for name, *pair in BODY_SENSORS if name == body)
-        sign = 1.0 if body == "mass" else -1.0
-        weights = self._fusion.weights
-        fused = [self.spectra[c] * weights[c].u for c in channels if c in weights]
-        return sign * np.sum(fused, axis=0)
-
     def calibrate_noise(self) -> "LogSignals":
         """Return the signals with the noise of laser and accelerometer as loud as they disagree.
 
