@@ -47,6 +47,16 @@ def fit_sheet(
     return fit_parameters([sheet], ParameterSet({A: 0.5, B: 0.5}, (a, b)), folds=folds)
 
 
+def test_parameters_that_replace_each_other_have_no_interval() -> None:
+    """Only their sum is known: rounding must not tell them apart."""
+    draw = np.random.default_rng(2)
+    first = draw.standard_normal(COUNT)
+    y = 2.0 * first + 0.01 * draw.standard_normal(COUNT)
+    fit = fit_sheet(lambda a, b: (a + b) * first - y, free(A), free(B))
+    assert fit.values[A] + fit.values[B] == pytest.approx(2.0, abs=0.01)
+    assert fit.std_errors[A] == fit.std_errors[B] == math.inf
+
+
 @pytest.mark.parametrize("alike", [0.9, 0.999, 0.99999])
 def test_beside_a_number_at_its_bound_the_others_are_found(alike: float) -> None:
     """a would go to 5 and may not: b is then what least squares says for a = 1."""

@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from scipy.special import stdtrit
 
-from table_io.block import Bool2D, Float1D, Float2D, Int1D
+from table_io.block import Bool1D, Bool2D, Float1D, Float2D, Int1D
 from twin.discovery.parameters import (
     FreeParameter,
     NuisanceKey,
@@ -30,6 +30,7 @@ MAX_DEPARTURE_SHARE = 0.1  # of the squares of a step: with more the model is no
 MAX_NOISE_SHARE = 0.9  # of the information on a parameter that is noise of the readings
 # of a parameter's curvature: with less in the training folds, they do not determine it
 MIN_CURVATURE_SHARE = 1e-3
+MIN_INFORMATION = 1e-9  # of that on the best combination of parameters: less is rounding
 
 Argument = TypeVar("Argument")
 Result = TypeVar("Result")
@@ -320,15 +321,8 @@ class _LevenbergMarquardt:
         parameters = self.start.with_vector(x)
         products = jacobian @ jacobian.T
         hessian = self.noise.take_off(products) if self.noise else products
-        scale = _curvature_scale(hessian)
         # parameters at a bound are fixed there
-        inner = np.flatnonzero((self.low < x) & (x < self.high))
-        inner_block = np.ix_(inner, inner)
-        inverse = np.zeros_like(hessian)
-        inverse[inner_block] = np.linalg.pinv(
-            (hessian / np.outer(scale, scale))[inner_block], hermitian=True
-        )
-        inverse /= np.outer(scale, scale)
+        inverse, is_open = _invert_information(hessian, (self.low < x) & (x < self.high))
         r = self.select_training(current)
         cost = float(r @ r)
         first, count = 0, 0
@@ -362,9 +356,9 @@ class _LevenbergMarquardt:
         # small-sample correction: each fitted parameter costs one degree of freedom
         scatter *= count / max(count - len(self.free), 1)
         covariance = inverse @ (scatter + rest_scatter) @ inverse
-        sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        sd = np.where(is_open, math.inf, np.sqrt(np.maximum(np.diag(covariance), 0.0)))
         block_counts = _count_effective_blocks(information, np.diag(products))
-        unit_sd = np.sqrt(np.maximum(np.diag(inverse), 0.0))
+        unit_sd = np.where(is_open, math.inf, np.sqrt(np.maximum(np.diag(inverse), 0.0)))
         white_sd = unit_sd * math.sqrt(max(cost / max(self.count, 1), 1.0))
         divisor = np.where(sd > 0, sd, 1.0)  # before they are widened, which correlates nothing
         sd = _widen_for_few_blocks(sd, white_sd, block_counts)
@@ -479,6 +473,21 @@ def _count_effective_blocks(information: Sequence[list[Float1D]], total: Float1D
         if blocks.sum() > 0.5 * total[i]:
             counts[i] = blocks.sum() ** 2 / (blocks @ blocks)
     return counts
+
+
+def _invert_information(information: Float2D, inner: Bool1D) -> tuple[Float2D, Bool1D]:
+    """Return (inverse on the inner parameters, (p, p), 0 elsewhere; which are left open, (p,)).
+
+    Where parameters replace each other, rounding is all that tells them apart.
+    """
+    scale, chosen = _curvature_scale(information), np.flatnonzero(inner)
+    block = np.ix_(chosen, chosen)
+    values, vectors = np.linalg.eigh((information / np.outer(scale, scale))[block])
+    is_known = values > MIN_INFORMATION * values.max(initial=0.0)
+    inverse, is_open = np.zeros_like(information), np.zeros(scale.size, dtype=bool)
+    inverse[block] = (vectors[:, is_known] / values[is_known]) @ vectors[:, is_known].T
+    is_open[chosen] = (vectors[:, ~is_known] ** 2).sum(axis=1) > MIN_INFORMATION
+    return inverse / np.outer(scale, scale), is_open
 
 
 def _widen_for_few_blocks(sd: Float1D, white_sd: Float1D, block_counts: Float1D) -> Float1D:

@@ -305,7 +305,6 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
             if cell in spectra:
                 share = float(np.vdot(total, spectra[cell]).real) / power
                 spectra[cell] = share * force
-    square = -(signals.omega**2)
     if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
         spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
     if "table_acc_m_s2" in spectra:

@@ -243,10 +243,9 @@ def record(
     absent = {*lab.missing, "mass_disp_m" if lab.has_relative_laser else "rel_disp_m"}
     for number, (name, values) in enumerate(true.items()):
         level = noise[name.split("_")[1]]
-        if lab.skew_s:
-            time = np.arange(values.size) / FINE_HZ
-            values = np.interp(time - number * lab.skew_s, time, values)
-        read = _read(values, test.rate_hz, level, lab, rng, name)
+        time = np.arange(values.size) / FINE_HZ
+        skewed = np.interp(time - number * lab.skew_s, time, values) if lab.skew_s else values
+        read = _read(skewed, test.rate_hz, level, lab, rng, name)
         if lab.bits:
             step = 2.0 * float(np.abs(read).max()) / 2**lab.bits
             read = step * np.round(read / step)
