@@ -21,6 +21,7 @@ MIN_REST_S = 0.5  # a shorter rest is not used
 CLEAR_REST_S = 2.0  # from here on the rest alone shows whether there is hum
 PART_COUNT = 4  # of a record without rest: hum is in every part
 SURROUNDINGS_HZ = 5.0
+MAX_HARMONIC_HZ = 0.5 * SURROUNDINGS_HZ / MAINS_TOLERANCE  # above it a line may be anywhere there
 MIN_LINE_RATIO = 20.0  # power of a line over the mean around it; noise alone hardly reaches it
 LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a line over time
 SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
@@ -75,6 +76,8 @@ def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
 
     With all near its lines, as hum may beat. What is most of the record is the motion, no hum.
     """
+    if values.size < PART_COUNT * MIN_REST_S * rate_hz:
+        return values
     known = interpolate_missing(values)
     spectrum, hz = rfft(known - known.mean()), rfftfreq(known.size, 1.0 / rate_hz)
     parts = [_measure_lines(part[None], rate_hz) for part in np.array_split(known, PART_COUNT)]
@@ -111,7 +114,7 @@ def _measure_lines(records: Float2D, rate_hz: float) -> list[_Line]:
     spectra = [rfft(record * window, padded) for record in tared]
     lines = []
     for mains in MAINS_HZ:
-        for nominal in np.arange(mains, rate_hz / 2 - SURROUNDINGS_HZ, mains):
+        for nominal in np.arange(mains, min(rate_hz / 2 - SURROUNDINGS_HZ, MAX_HARMONIC_HZ), mains):
             first, last = np.searchsorted(
                 hz, nominal + (SURROUNDINGS_HZ + 2 * rate_hz / size) * np.array([-1.0, 1.0])
             )

@@ -115,9 +115,7 @@ def fit_with_misfit(
         )
     weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
     ratios = [new.weight / old.weight for new, old in zip(weighted, log_residuals, strict=True)]
-    fit = fit_parameters(
-        weighted, fit.parameters, folds=folds, mapper=mapper, without_noise=True
-    )
+    fit = fit_parameters(weighted, fit.parameters, folds=folds, mapper=mapper, without_noise=True)
     entries = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
     held_out = tuple(
         np.where(residuals.entry_row < len(residuals.rows), ratio, 1.0) * values
