@@ -228,7 +228,7 @@ class TableTwinResult:
             text["response"] = _describe_response(model).model_dump(exclude_none=True)
         text["judgement"] = self.judgement.model_dump(exclude_none=True)
         text["provenance"] = self.provenance.model_dump()
-        return format_toml(text)
+        return seal_text(format_toml(text))
 
     def save(self, path: Path) -> Path:
         """Write the twin's file and return its path.
@@ -239,7 +239,7 @@ class TableTwinResult:
             raise InputError(reason, where=path)
         if path.exists():
             raise InputError("exists already", where=path, remedy="give a new name")
-        path.write_text(seal_text(self.format_toml()), encoding="utf-8")
+        path.write_text(self.format_toml(), encoding="utf-8")
         return path
 
 
