@@ -12,7 +12,7 @@ from table_io.errors import InputError
 from tests.discovery.played import SNM
 from twin.laws.effect_file import EffectFile, format_effect_file
 from twin.laws.expression import FUNCTIONS, build_function, parse_expression, parse_unit
-from twin.laws.properties import evaluate_law
+from twin.laws.properties import evaluate_law, is_linear_in_rate
 from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.inverse_dynamics import forces_along
@@ -302,3 +302,14 @@ class TestRange:
         (range_exit,) = find_range_exits(add(effect, k=1e8), deep)
         assert range_exit.sample == 1
         assert math.isclose(range_exit.value, 1.1e-3)
+
+
+def test_a_bumper_law_that_its_values_leave_undefined_is_refused() -> None:
+    effect = read_effect(
+        DEEP.replace("abs(d)", "abs(d) * (2.0 - sqrt(1.0 - v / w))")
+        + TAU.replace("tau", "w").replace("'s'", "'m/s'").replace("0.05", "50.0")
+    )
+    values = {"k": 1e8, "w": 0.9}
+    constants = tuple(effect.work_out_constants(SNM.base.as_dict(), values).values())
+    with pytest.raises(InputError, match="cannot be evaluated with these values"):
+        is_linear_in_rate(effect, constants)

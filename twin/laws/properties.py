@@ -122,12 +122,16 @@ def law_properties(effect: Effect, c: tuple[float, ...]) -> LawProperties:
     try:
         return _measure_law(effect, c)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-        raise InputError(
-            f"its law cannot be evaluated with these values: {error}",
-            where=f"effect {effect.id!r}",
-            value=list(c),
-            remedy="change the values of its parameters",
-        ) from None
+        raise _explain_failure(effect, c, error) from None
+
+
+def _explain_failure(effect: Effect, c: tuple[float, ...], error: Exception) -> InputError:
+    return InputError(
+        f"its law cannot be evaluated with these values: {error}",
+        where=f"effect {effect.id!r}",
+        value=list(c),
+        remedy="change the values of its parameters",
+    )
 
 
 def _measure_law(effect: Effect, c: tuple[float, ...]) -> LawProperties:
@@ -158,12 +162,18 @@ def _measure_law(effect: Effect, c: tuple[float, ...]) -> LawProperties:
 
 @cache
 def is_linear_in_rate(effect: Effect, c: tuple[float, ...]) -> bool:
-    """Return whether a law is elastic plus a dashpot with these constants."""
+    """Return whether a law is elastic plus a dashpot with these constants.
+
+    InputError where it cannot be evaluated at rest, or at 1 m/s.
+    """
     force, _ = evaluate_law(effect, c)
     relaxed = (0.0,) * len(effect.states)
     for q, w, a, t in list_probes(effect):
-        push, slow = force(q, w, a, t, relaxed), force(q, 0.0, a, t, relaxed)
-        linear = slow + w * (force(q, 1.0, a, t, relaxed) - slow)
+        try:
+            push, slow, fast = (force(q, rate, a, t, relaxed) for rate in (w, 0.0, 1.0))
+        except (ArithmeticError, ValueError) as error:
+            raise _explain_failure(effect, c, error) from None
+        linear = slow + w * (fast - slow)
         if abs(push - linear) > 1e-6 * (abs(push) + abs(slow) + abs(linear)):
             return False
     return True
