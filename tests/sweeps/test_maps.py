@@ -3,6 +3,7 @@
 import itertools
 import math
 import re
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 
@@ -120,7 +121,7 @@ def test_the_report_is_written_again_from_the_stored_arrays(study_folder: Path) 
     assert call_main("report", study_folder, "--format", "pdf").returncode == 2
 
 
-def test_the_page_reads_every_array_once(
+def test_the_page_reads_no_array_again_for_each_chunk_or_figure(
     study_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[str] = []
@@ -136,7 +137,8 @@ def test_the_page_reads_every_array_once(
     monkeypatch.setattr("twin.studies.maps.page.embed_images", lambda _: [])
     write_map_page(study_folder)
     assert {"peak_disp_m", "specimen.gap_mm"} <= {*read}
-    assert len(read) == len({*read})
+    # once to compare it with what was stored, once to draw
+    assert max(Counter(read).values()) <= 2
 
 
 def test_a_map_of_the_folds_is_the_continuation_of_each_case(tmp_path: Path) -> None:

@@ -121,7 +121,7 @@ class _CommandQueue:
             return None
 
         def answer(text: str) -> None:
-            log.info("command %s: %s", request.name, text)
+            log.info("command %s, %s", request.name, "accepted" if text == ACCEPTED else text)
             request.reply(text)
 
         command = OperatorCommand(request.name, reason or f"asked to {request.name}", answer)

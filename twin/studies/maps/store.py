@@ -266,7 +266,10 @@ def hash_arrays(arrays: Mapping[str, npt.NDArray[Any]]) -> str:
 
 
 def hash_stored(group: Any, names: Iterable[str], span: slice) -> str:
-    """Return the hash of the variables of cases as they are on the disk; "" if unreadable."""
+    """Return the hash of the variables of cases as they are on the disk; "" if unreadable.
+
+    `group` holds the arrays by name.
+    """
     try:
         return hash_arrays({name: group[name][span] for name in names})
     except READ_ERRORS:
@@ -333,8 +336,12 @@ class Manifest:
 
     def require_unchanged(self, group: Any) -> None:
         """Raise InputError for the first chunk that is not on the disk as it was stored."""
+        try:
+            arrays = {name: group[name] for name in self._names}
+        except READ_ERRORS:  # no chunk of an array that is gone
+            arrays = {}
         for chunk in self.chunks.values():
-            if not self.holds(group, chunk):
+            if not self.holds(arrays, chunk):
                 last = chunk.first + chunk.cases - 1
                 raise InputError(
                     f"chunk {chunk.chunk}, cases {chunk.first} to {last}, is not what was stored: "
