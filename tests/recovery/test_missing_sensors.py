@@ -9,6 +9,7 @@ from tests.studies.evidence.laboratory import Instruments, Specimen, StepTest, r
 from twin.discovery.discover import prepare_problem
 from twin.discovery.loading import load_logs
 from twin.discovery.nuisances import list_sizes, widen_intervals
+from twin.discovery.parameters import STIFFNESS, BaseKey, GapKey
 from twin.model.model import Model
 from twin.model.parameters import Parameters
 
@@ -50,3 +51,15 @@ def test_the_parameters_are_those_of_the_specimen(case: str, tmp_path: Path) -> 
     for nuisance, size in list_sizes(problem.log_residuals[0], fit.parameters):
         if nuisance.kind == "lag":
             assert abs(size * nuisance.size) < 4e-4, nuisance
+
+
+def test_bumpers_that_the_mass_does_not_reach_are_no_parameters(tmp_path: Path) -> None:
+    """Without load cells the contacts are those of the model: a gap far off must not make any."""
+    specimen = Specimen(gap_mm=40.0)
+    cells = ("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")
+    columns = record(specimen, Instruments(missing=cells), 38, SHORT)
+    logs, _ = load_logs([import_columns(columns, tmp_path, format_profile(specimen, SHORT))])
+    fit = prepare_problem(logs, START).first_fit
+    names = {free.name for free in fit.free if isinstance(free.key, BaseKey | GapKey)}
+    assert names == {"stiffness", "damping"}
+    assert fit.values[STIFFNESS] == pytest.approx(specimen.k, rel=0.02)

@@ -35,7 +35,7 @@ from twin.discovery.parameters import (
     list_base_parameters,
     list_model_effect_parameters,
 )
-from twin.discovery.residuals import LogResiduals, build_log_residuals
+from twin.discovery.residuals import MAX_GAP_ERROR_M, LogResiduals, build_log_residuals
 from twin.discovery.selection import (
     FittedSet,
     ProgressCallback,
@@ -259,7 +259,7 @@ def find_implausible_parameters(model: Model, fit: FitResult) -> list[str]:
                 f"{expected:.4g} in the model; check that "
                 "the model and the mass are those of this specimen"
             )
-        if isinstance(parameter.key, GapKey) and abs(value) > 1e-3:
+        if isinstance(parameter.key, GapKey) and abs(value) > MAX_GAP_ERROR_M:
             notes.append(
                 f"{parameter.name}: each gap differs by {1e3 * value:+.2f} mm from the stated one"
             )
