@@ -38,7 +38,7 @@ from twin.discovery.parameters import (
     size_of_unit,
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
-from twin.discovery.signals import SENSOR_PAIRS, LogSignals
+from twin.discovery.signals import SENSOR_PAIRS, LogSignals, weigh_sensors
 from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
@@ -315,14 +315,13 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
 def _smooth_table_acc(signals: LogSignals) -> Spectrum:
     """Return the acceleration of the table in m/s2 from its sensors, less their noise."""
     grid, square = signals.grid, -(signals.omega**2)
-    acc, s_a = signals.spectra["table_acc_m_s2"], signals.noise["table_acc_m_s2"]
-    density = s_a
+    acc, density = signals.spectra["table_acc_m_s2"], signals.noise["table_acc_m_s2"]
     if "table_disp_m" in signals.spectra:
-        # the mean of both, each weighted by the inverse of its variance
-        s_x = np.abs(square) * signals.noise["table_disp_m"]
-        variance = s_a**2 + s_x**2
-        acc = (s_a**2 * square * signals.spectra["table_disp_m"] + s_x**2 * acc) / variance
-        density = s_a * s_x / np.sqrt(variance)
+        laser_share, acc_share, error_m = weigh_sensors(
+            signals.omega, signals.noise["table_disp_m"], density
+        )
+        acc = square * (laser_share * signals.spectra["table_disp_m"] + acc_share * acc)
+        density = np.abs(square) * error_m
     density = density / math.sqrt(grid.decimation)
     return acc * _pass_motion(signals, grid.to_time_domain(acc), density)
 

@@ -279,6 +279,23 @@ def derives_acc(channels: Container[str]) -> bool:
     return "mass_acc_m_s2" not in channels and "table_acc_m_s2" in channels
 
 
+def weigh_sensors(
+    omega: Float1D, laser: Float1D, accelerometer: Float1D
+) -> tuple[Float1D, Float1D, Float1D]:
+    """Return the shares of both readings in a displacement, and the density of its noise in m.
+
+    Each by frequency, (frequency,), as the densities given: the mean of both, weighted by the
+    inverse of their variances. The share of the accelerometer is in s2.
+    """
+    square = omega**2
+    variance = accelerometer**2 + square**2 * laser**2
+    return (
+        accelerometer**2 / variance,
+        -square * laser**2 / variance,
+        accelerometer * laser / np.sqrt(variance),
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _ChannelWeights:
     """Share of a displacement or acceleration in the fusion, gains by frequency, (frequency,)."""
@@ -336,17 +353,17 @@ class _SensorFusion:
             self.weights[laser] = _ChannelWeights(sign * self.low_pass)
             return s_x
         s_a, w2 = np.hypot.reduce([self.noise[name] for name in accelerometers]), self.omega**2
+        laser_share, acc_share, density = weigh_sensors(self.omega, s_x, s_a)
         variance = s_a**2 + w2**2 * s_x**2
         residual = self.low_pass / np.sqrt(variance) / self.kept_share
         self.weights[laser] = _ChannelWeights(
-            sign * s_a**2 / variance * self.low_pass, body, w2 * residual
+            sign * laser_share * self.low_pass, body, w2 * residual
         )
         for name, own_sign in accelerometers.items():
             self.weights[name] = _ChannelWeights(
-                -sign * own_sign * w2 * s_x**2 / variance * self.low_pass, body, own_sign * residual
+                sign * own_sign * acc_share * self.low_pass, body, own_sign * residual
             )
         self.sensitivity[body] = 1.0 / (float(np.sqrt(variance[0])) * self.kept_share)
-        density: Float1D = s_a * s_x / np.sqrt(variance)
         return density
 
     def fuse(
