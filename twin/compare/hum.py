@@ -6,7 +6,7 @@ apart is time: hum is there at rest and lasts for the whole record, a harmonic b
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -50,14 +50,12 @@ def remove_hum(
     rate_hz = grid.rate_hz / grid.decimation
     records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
     rest = records[:, at_rest[:: grid.decimation]]
-    parts = [_measure_lines(part, rate_hz) for part in np.array_split(records, PART_COUNT, axis=1)]
     has_rest = rest.shape[1] >= MIN_REST_S * rate_hz
     lines_at_rest = _measure_lines(rest, rate_hz) if has_rest else itertools.repeat(None)
     cleaned = dict(spectra)
-    for resting, *in_parts in zip(lines_at_rest, *parts, strict=False):
-        amplitudes = np.median([line.amplitudes for line in in_parts], axis=0)
-        is_hum = lasting = np.logical_and.reduce([line.stands_out for line in in_parts])
-        line_hz = float(np.median([line.frequency_hz for line in in_parts]))
+    for resting, line in zip(lines_at_rest, _measure_lasting_lines(records, rate_hz), strict=False):
+        line_hz, amplitudes, lasting = line
+        is_hum = lasting
         if resting is not None:
             # one that does not stand out at rest must not be weaker there than in motion
             is_hum = lasting & (amplitudes <= MAX_EXCESS * resting.amplitudes)
@@ -80,12 +78,10 @@ def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
         return values
     known = interpolate_missing(values)
     spectrum, hz = rfft(known - known.mean()), rfftfreq(known.size, 1.0 / rate_hz)
-    parts = [_measure_lines(part[None], rate_hz) for part in np.array_split(known, PART_COUNT)]
     is_hum = np.zeros(hz.size, dtype=bool)
-    for in_parts in zip(*parts, strict=True):
-        if all(line.stands_out[0] for line in in_parts):
-            line_hz = float(np.median([line.frequency_hz for line in in_parts]))
-            is_hum |= np.abs(hz - line_hz) < BEAT_HZ
+    for line in _measure_lasting_lines(known[None], rate_hz):
+        if line.stands_out[0]:
+            is_hum |= np.abs(hz - line.frequency_hz) < BEAT_HZ
     power = np.abs(spectrum) ** 2
     if power[is_hum].sum() > 0.5 * power.sum():
         return values
@@ -129,6 +125,18 @@ def _measure_lines(records: Float2D, rate_hz: float) -> list[_Line]:
             amplitudes = 2.0 * np.sqrt(inside.max(axis=1)) / window.sum()
             lines.append(_Line(frequency_hz, amplitudes, ratio > MIN_LINE_RATIO))
     return lines
+
+
+def _measure_lasting_lines(records: Float2D, rate_hz: float) -> Iterator[_Line]:
+    """Yield the medians of each line over the parts of records; it stands out if it does in all."""
+    parts = [_measure_lines(part, rate_hz) for part in np.array_split(records, PART_COUNT, axis=1)]
+    for in_parts in zip(*parts, strict=True):
+        frequencies_hz, amplitudes, stands_out = zip(*in_parts, strict=True)
+        yield _Line(
+            float(np.median(frequencies_hz)),
+            np.median(amplitudes, axis=0),
+            np.logical_and.reduce(stands_out),
+        )
 
 
 def _remove_line(
