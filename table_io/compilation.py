@@ -1,45 +1,51 @@
-"""Numba compilation of kernels, and a cache on disk that follows all the code in a kernel."""
+"""Numba compilation of kernels, and a cache on disk that knows them by all that is in them."""
 
 import hashlib
-import shutil
+import inspect
+import pickle
+import platform
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from enum import Enum
 from functools import cache as compute_once
 from functools import wraps
-from inspect import signature
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
+import llvmlite
+import numba
 from numba import njit, types
-from numba.core.caching import FunctionCache
+from numba.core.compiler import CompileResult
+from numba.core.serialize import dumps
 from numba.extending import overload, register_jitable
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-SOURCE_MARKER = "source.txt"  # in a folder of compiled kernels: the folder of their source files
+MAX_UNUSED_DAYS = 30.0  # of a compiled kernel, which is removed then
 # Their functions are replaced by numba's own, which numba's version in the cache stands for.
 _REPLACED_PACKAGES = frozenset({"builtins", "cmath", "math", "numba", "numpy"})
 
 
-def jit_kernel(*signatures: Any, cache: bool = False) -> Callable[[F], F]:
+def jit_kernel(*signatures: Any) -> Callable[[F], F]:
     """Compile a kernel that Python calls with numba.njit, keeping its type annotations.
 
-    With `cache` it is kept on disk until its own file changes, or a function or constant that is
-    compiled into it, in whatever file. Where no folder can be written it is compiled every time.
+    What was compiled is kept on disk and loaded wherever the same code is compiled again, in any
+    process and copy of the sources, see `_KernelCache`.
     """
 
     def decorate(function: F) -> F:
+        if function.__code__.co_filename == "<string>":
+            # numba's linker tells functions apart by name, and written ones share theirs.
+            function.__qualname__ += f"_{fingerprint_kernel(function)[:16]}"
         kernel: Any = njit(nogil=True)(function)
         if not hasattr(kernel, "py_func"):
             return function  # NUMBA_DISABLE_JIT
-        if cache:
-            with suppress(RuntimeError):  # no folder for the cache can be written
-                kernel._cache = _KernelCache(function)
+        kernel._cache = _KernelCache(function)
         for each in signatures:
-            for one_signature in each if isinstance(each, list) else [each]:
-                kernel.compile(one_signature)
+            for signature in each if isinstance(each, list) else [each]:
+                kernel.compile(signature)
         if signatures:
             kernel.disable_compile()
         return cast("F", kernel)
@@ -48,8 +54,8 @@ def jit_kernel(*signatures: Any, cache: bool = False) -> Callable[[F], F]:
 
 
 def jit_untyped_kernel(function: Callable[..., Any]) -> Any:
-    """Compile a kernel without type annotations and keep it on disk, see `jit_kernel`."""
-    return jit_kernel(cache=True)(function)
+    """Compile a kernel without type annotations, see `jit_kernel`."""
+    return jit_kernel()(function)
 
 
 # Marks a helper of kernels that Python never calls.
@@ -61,10 +67,13 @@ def jit_helper(*, inlined: bool = False) -> Callable[[F], F]:
 
     It has no compiled entry point from Python, which would double its compilation time.
     """
-    decorator: Callable[[F], F] = register_jitable(
-        nogil=True, forceinline=inlined, no_cfunc_wrapper=True
-    )
-    return decorator
+    options = {"nogil": True, "forceinline": inlined, "no_cfunc_wrapper": True}
+
+    def decorate(function: F) -> F:
+        function.helper_options = options  # type: ignore[attr-defined]
+        return cast("F", register_jitable(**options)(function))
+
+    return decorate
 
 
 def jit_untyped_helper(function: Callable[..., Any]) -> Any:
@@ -79,7 +88,7 @@ def jit_helper_unless_none(argument: str, otherwise: Callable[..., Any]) -> Call
     """
 
     def decorate(function: F) -> F:
-        position = list(signature(function).parameters).index(argument)
+        position = list(inspect.signature(function).parameters).index(argument)
 
         @wraps(function)
         def helper(*args: Any) -> Any:
@@ -120,16 +129,20 @@ def _describe_item(item: Any, visited: set[int]) -> Iterator[str]:
             yield from _describe_item(element, visited)
     elif isinstance(item, type):
         yield f"{item.__qualname__} {getattr(item, '_fields', None)}"
+        yield repr(list(getattr(item, "__members__", {}).items()))
         yield from _describe_item(tuple(getattr(item, "_field_defaults", {}).values()), visited)
     elif hasattr(item, "tobytes"):  # arrays and numbers of numpy
         yield f"{item.dtype} {item.shape} {item.tobytes().hex()}"
     else:
+        yield repr(getattr(item, "targetoptions", getattr(item, "helper_options", None)))
         # What is compiled: of dispatchers their function, of choices by type all that are chosen.
         for function in getattr(item, "implementations", (getattr(item, "py_func", item),)):
             if isinstance(function, FunctionType):
                 yield from _describe_function(function, visited)
-            else:
-                yield type(function).__qualname__
+            elif _is_replaced(getattr(function, "__module__", None)):
+                yield f"{function.__module__} {function.__qualname__}"
+            else:  # nothing is known of it: what was compiled serves this process only
+                yield f"{type(function).__qualname__} {id(function)}"
 
 
 def _describe_function(function: FunctionType, visited: set[int]) -> Iterator[str]:
@@ -181,51 +194,73 @@ def _describe_code(code: CodeType) -> str:
     return f"{code.co_code.hex()} {constants} {code.co_names}"
 
 
-class _KernelCache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of a function, valid as long as all that is compiled into it is the same.
+class _KernelCache:
+    """The signatures of a kernel that were compiled, on disk: a file each, for numba's dispatcher.
 
-    numba compares a stamp of the function's own file only. The stamp is completed at the first
-    compilation, when all that the function calls is defined. An outdated index is replaced and its
-    files are written over.
+    The name of a file is a digest of all that decides what is in it: code and constants of the
+    kernel and of what it calls, signature, processor, versions, and this module. So it is found
+    from every copy of the sources, never outdated and never written with other content. A file that
+    cannot be read or written costs only time.
     """
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self.cache_path = numba.config.CACHE_DIR
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled function for a signature, None if it has to be compiled."""
-        source_stamp = self._impl.locator.get_source_stamp()
-        self._cache_file._source_stamp = (source_stamp, fingerprint_kernel(self._py_func))
+        target_context.refresh()
+        path = self._locate(signature, target_context.codegen())
         try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # a damaged pickle can raise anything
-            with suppress(OSError):
-                self.flush()
+            content = path.read_bytes()
+        except OSError:
             return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Keep a compiled function; without room on the disk it serves this process only."""
         with suppress(OSError):
-            super().save_overload(sig, data)
-            folder, source = Path(self._cache_path), Path(self._impl.locator._py_file).absolute()
-            (folder / SOURCE_MARKER).write_text(str(source.parent))
-            remove_outdated_kernels(folder, source)
-            _remove_abandoned_once(folder.parent)
+            path.touch()  # still used
+        digest, data = content[:32], content[32:]
+        if hashlib.sha256(data).digest() != digest:
+            return None
+        return CompileResult._rebuild(target_context, *pickle.loads(data))
+
+    def save_overload(self, signature: Any, compiled: Any) -> None:
+        """Keep a compiled function, unless it holds addresses of this process."""
+        if compiled.library.has_dynamic_globals:
+            return
+        path = self._locate(signature, compiled.codegen)
+        data = dumps(compiled._reduce())
+        with suppress(OSError):
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+                file.write(hashlib.sha256(data).digest() + data)
+            Path(file.name).replace(path)
+            _remove_unused_once(path.parent)
+
+    def _locate(self, signature: Any, codegen: Any) -> Path:
+        parts = (
+            fingerprint_kernel(self._function),
+            repr(signature),
+            repr(codegen.magic_tuple()),
+            _identify_compiler(),
+        )
+        key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
+        return Path(self.cache_path) / f"{self._function.__name__}-{key[:40]}.kernel"
 
 
-def remove_outdated_kernels(folder: Path, source: Path) -> None:
-    """Remove compiled functions of a source file that are older than the file.
-
-    The line of a function is part of the file names, so moved and deleted functions leave files.
-    """
-    changed_at = source.stat().st_mtime
-    for path in folder.glob(f"{source.stem}.*.nb[ci]"):
-        if path.stat().st_mtime < changed_at:
-            path.unlink(missing_ok=True)
+@compute_once
+def _identify_compiler() -> str:
+    """Return versions of what compiles, and the code here that decides how."""
+    versions = numba.__version__, llvmlite.__version__, platform.python_version()
+    return f"{versions} {Path(__file__).read_text()}"
 
 
-def remove_abandoned_folders(root: Path) -> None:
-    """Remove the folders of compiled kernels whose source folder does not exist any more."""
-    for marker in root.glob(f"*/{SOURCE_MARKER}"):
-        if not Path(marker.read_text()).is_dir():
-            shutil.rmtree(marker.parent, ignore_errors=True)
+def remove_unused_kernels(folder: Path) -> None:
+    """Remove what was last used `MAX_UNUSED_DAYS` before the newest in a folder of kernels."""
+    with suppress(OSError):  # another process removes too
+        used = {path: path.stat().st_mtime for path in folder.rglob("*")}
+        oldest = max(used.values(), default=0.0) - MAX_UNUSED_DAYS * 86400.0
+        for path, used_at in used.items():
+            if path.is_file() and used_at < oldest:
+                path.unlink(missing_ok=True)
 
 
-_remove_abandoned_once = compute_once(remove_abandoned_folders)
+_remove_unused_once = compute_once(remove_unused_kernels)

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,16 +13,16 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from numba import float64
 
 from table_io import compilation
 from table_io.compilation import (
-    SOURCE_MARKER,
     fingerprint_kernel,
     jit_helper,
     jit_kernel,
-    remove_abandoned_folders,
-    remove_outdated_kernels,
+    remove_unused_kernels,
 )
+from twin.laws.expression import build_function
 
 # A kernel of a package that is not ours, as a plug-in brings it; `{}` are changed by the tests.
 LAW_MODULE = """
@@ -48,7 +49,7 @@ from table_io.compilation import jit_kernel
 from {package} import constants
 from {package}.laws import TABLE, inlined, present
 
-@jit_kernel(cache=True)
+@jit_kernel()
 def kernel(x):
     return later(x) + TABLE[1][1] + present(x) + present(None) + constants.FACTOR
 
@@ -101,17 +102,23 @@ def run_kernel(folder: Path, cache: Path) -> list[str]:
 def test_kernel_follows_a_function_in_another_file(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     write_package(tmp_path, "plant_laws")
-    (cache / "removed_installation").mkdir(parents=True)
-    (cache / "removed_installation" / SOURCE_MARKER).write_text(str(tmp_path / "no_folder"))
     total = sum(VALUES.values())
     assert run_kernel(tmp_path, cache) == [str(total), "0"]
-    assert [path.name.rpartition("_")[0] for path in cache.iterdir()] == ["plant_laws"]
     assert run_kernel(tmp_path, cache) == [str(total), "1"]
-    files = sorted(cache.rglob("*"))
     write_package(tmp_path, "plant_laws", dispatched=105.0)
     assert run_kernel(tmp_path, cache) == [str(total + 100.0), "0"]
-    assert run_kernel(tmp_path, cache) == [str(total + 100.0), "1"]
-    assert sorted(cache.rglob("*")) == files, "the cache grows with every change"
+    copy = tmp_path / "clone"
+    copy.mkdir()
+    write_package(copy, "plant_laws")
+    assert run_kernel(copy, cache) == [str(total), "1"], "not found from another copy"
+
+
+def test_signatures_do_not_share_what_was_compiled(import_package: Any) -> None:
+    total = sum(VALUES.values())
+    for hits in (0, 1):
+        kernel = import_package().kernel
+        assert [kernel(1.0), kernel(1), kernel(1.0 + 0j)] == [total, total, total + 0j]
+        assert set(kernel.stats.cache_hits.values()) == ({1} if hits else set())
 
 
 @pytest.fixture
@@ -224,71 +231,77 @@ def test_kernels_name_all_modules_that_they_are_made_of() -> None:
     )
 
 
+@pytest.mark.parametrize("folder", ["/proc/no_folder", __file__])
 def test_cache_that_cannot_be_written_costs_only_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folder: str, import_package: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "/proc/no_folder")
-    monkeypatch.setattr(
-        numba.core.caching.CacheImpl,
-        "_locator_classes",
-        numba.core.caching.CacheImpl._locator_classes[:1],
-    )
-
-    @jit_kernel(cache=True)
-    def double(x: float) -> float:
-        return 2.0 * x
-
-    assert double(3.0) == 6.0
-    assert double.stats.cache_path is None  # type: ignore[attr-defined]
+    monkeypatch.setattr(numba.config, "CACHE_DIR", folder)
+    assert import_package().kernel(1.0) == sum(VALUES.values())
 
 
-@pytest.mark.parametrize("damaged", ["*.nbi", "*.nbc"])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 1.0])
 def test_damaged_file_is_compiled_and_written_again(
-    damaged: str, tmp_path: Path, import_package: Any
+    kept: float, tmp_path: Path, import_package: Any
 ) -> None:
     total = sum(VALUES.values())
     assert import_package().kernel(1.0) == total
-    paths = list((tmp_path / "cache").rglob(damaged))
-    assert paths
-    for path in paths:
-        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    [path] = (tmp_path / "cache").glob("kernel-*")
+    content = path.read_bytes()
+    if kept < 1.0:
+        path.write_bytes(content[: int(kept * len(content))])
+    else:
+        path.write_bytes(content[:-100] + bytes(100))
     for hits in (0, 1):
         kernel = import_package().kernel
         assert kernel(1.0) == total
         assert sum(kernel.stats.cache_hits.values()) == hits
 
 
-def test_full_disk_costs_only_time(import_package: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_costs_only_time(
+    tmp_path: Path, import_package: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refuse(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(numba.core.caching.IndexDataCacheFile, "_save_data", refuse)
+    monkeypatch.setattr(Path, "replace", refuse)
     assert import_package().kernel(1.0) == sum(VALUES.values())
+    assert not list((tmp_path / "cache").glob("*.kernel"))
 
 
-def test_kernels_of_moved_functions_are_removed(tmp_path: Path) -> None:
-    source = tmp_path / "plant.py"
-    source.touch()
-    names = ("plant.step-7.py311.nbi", "plant.step-7.py311.1.nbc", "planting.step-7.py311.nbi")
-    for name in names:
-        (tmp_path / name).touch()
-        os.utime(tmp_path / name, (1.0, 1.0))
-    (tmp_path / "plant.step-9.py311.nbi").touch()
-    os.utime(source, (2.0, 2.0))
-    remove_outdated_kernels(tmp_path, source)
-    assert {path.name for path in tmp_path.iterdir()} == {
-        "plant.py", "plant.step-9.py311.nbi", "planting.step-7.py311.nbi"
-    }  # fmt: skip
+def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
+    write_package(tmp_path, "plant_laws")
+    with ThreadPoolExecutor(4) as pool:
+        started = [pool.submit(run_kernel, tmp_path, tmp_path / "cache") for _ in range(4)]
+    assert {each.result()[0] for each in started} == {str(sum(VALUES.values()))}
+    assert run_kernel(tmp_path, tmp_path / "cache")[1] == "1"
+    assert len(list((tmp_path / "cache").iterdir())) == 2  # and `later`
 
 
-def test_kernels_of_removed_installations_are_removed(tmp_path: Path) -> None:
-    for name, source in (("gone", tmp_path / "no"), ("kept", tmp_path)):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / SOURCE_MARKER).write_text(str(source))
-        (tmp_path / name / "plant.step-7.py311.nbi").touch()
-    (tmp_path / "foreign").mkdir()
-    remove_abandoned_folders(tmp_path)
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign", "kept"]
+def test_kernels_that_nobody_uses_are_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "model_of_a_removed_clone"
+    folder.mkdir()
+    for path in (tmp_path / "old.kernel", tmp_path / "new.kernel", folder / "plant.step.nbi"):
+        path.touch()
+    for path in (tmp_path / "old.kernel", folder / "plant.step.nbi"):
+        os.utime(path, (1.0, 1.0))
+    remove_unused_kernels(tmp_path)
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["new.kernel"]
+
+
+def test_kernel_in_use_is_not_removed(tmp_path: Path, import_package: Any) -> None:
+    import_package().kernel(1.0)
+    [path] = (tmp_path / "cache").glob("kernel-*")
+    os.utime(path, (1.0, 1.0))
+    import_package().kernel(1.0)
+    remove_unused_kernels(tmp_path / "cache")
+    assert path.exists()
+
+
+@pytest.mark.parametrize("factor", [3.0, 4.0])
+def test_written_functions_of_one_name_are_told_apart(factor: float) -> None:
+    kernels = [jit_kernel(float64(float64))(build_function(f"def law(x):\n return {n} * x"))
+               for n in (factor, factor + 10.0)]  # fmt: skip
+    assert [kernel(2.0) for kernel in kernels] == [2.0 * factor, 2.0 * factor + 20.0]
 
 
 def test_part_of_kernels_is_plain_python_outside_of_them() -> None:

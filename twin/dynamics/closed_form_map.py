@@ -105,7 +105,7 @@ def place_state(state: Float1D, x: Float1D, indices: Int1D, params: Float1D) -> 
     Right counts 1, left 2. A contact passes through the onset that brings u_j to the mass, so that
     the map is smooth where an onset passes through the start.
     """
-    state[:] = 0.0
+    state.fill(0.0)
     for j in range(indices.size):
         state[indices[j]] = x[j]
     touching = 0
@@ -129,7 +129,7 @@ def start_variations(
 ) -> None:
     """Set `variations` to those of the coordinates at a state, as from `place_state`."""
     n = indices.size
-    variations[:] = 0.0
+    variations.fill(0.0)
     for column in range(n):
         variations[indices[column], column] = 1.0
     for side in range(2):
@@ -213,7 +213,7 @@ def jump_variations(variations: Float2D, params: Float1D, side: int, onset: bool
             variations[1, i] += params[C_R + side] / params[MASS] * (variations[2 + side, i] - face)
             variations[2 + side, i] = face
     elif params[R_R + side] == 0.0:  # without a dashpot the face is back at once
-        variations[2 + side, :] = 0.0
+        variations[2 + side].fill(0.0)
 
 
 @jit_helper()
@@ -269,7 +269,9 @@ def record_minima(record: Variations, params: Float1D, begin: float, segment: Mo
         row, in_contact = minima[count], (mode >> side) & 1
         row[0], row[1] = (begin + at) * record.wave[1] / (2 * math.pi), side + 2 * in_contact
         row[2] = evaluate_motion(at, m, q)[0] / (params[K_R + side] if in_contact else 1.0)
-        record.work[:] = record.variations
+        for i in range(4):
+            for j in range(record.work.shape[1]):
+                record.work[i, j] = record.variations[i, j]
         flow_variations(record.work, params, mode, record.wave, progress[SINCE], begin + at)
         vary_guard(row[3:], record.work, params, mode, side)
         progress[MINIMUM_COUNT] += 1
@@ -350,7 +352,6 @@ _VECTOR, _MATRIX, _INTEGERS = float64[::1], float64[:, ::1], int64[::1]
     types.UniTuple(int64, 3)(
         _VECTOR, _INTEGERS, _VECTOR, DRIVE_TYPE, int64, _VECTOR, _MATRIX, _VECTOR, _MATRIX, _MATRIX
     ),
-    cache=True,
 )
 def advance_variations(
     x: Float1D,
@@ -406,7 +407,6 @@ def advance_variations(
 
 @jit_kernel(
     types.void(_VECTOR, _INTEGERS, _VECTOR, DRIVE_TYPE, int64, _MATRIX),
-    cache=True,
 )
 def record_points(
     x: Float1D, indices: Int1D, params: Float1D, drive: SineDrive, steps: int, points: Float2D
@@ -423,7 +423,6 @@ def record_points(
 
 @jit_kernel(
     types.void(_MATRIX, _INTEGERS, _VECTOR, DRIVE_TYPE, REGIONS_TYPE, int64, _INTEGERS, _INTEGERS),
-    cache=True,
 )
 def capture_points(
     starts: Float2D,

@@ -38,10 +38,7 @@ def pack_constants(
 
 
 def compile_laws(effects: Sequence[Effect]) -> AddedLaws | None:
-    """Compile the laws of these effects into one function, None for none.
-
-    Compiled once in every process: numba's cache on disk does not know that a law changed.
-    """
+    """Compile the laws of these effects into one function, None for none."""
     return _compile_text(write_laws(tuple(effects))) if effects else None
 
 

@@ -225,7 +225,7 @@ _READ = types.Array(float64, 1, "A", readonly=True)
 _WRITE = types.Array(float64, 2, "A")
 
 
-@jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE), cache=True)
+@jit_kernel(int64(float64[::1], _READ, _READ, _WRITE, _WRITE))
 def advance_samples(
     state: Float1D, params: Float1D, base_acc: Float1D, out: Float2D, events: Float2D
 ) -> int:

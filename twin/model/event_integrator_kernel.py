@@ -504,4 +504,4 @@ def build_kernel(has_laws: bool) -> Callable[..., int]:
     """
     coefficients, laws = LAWS_TYPES if has_laws else PLAIN_TYPES
     kernel_type = int64(float64[::1], coefficients, float64[:, ::1], laws, _READ, _OUT, _OUT)
-    return jit_kernel(kernel_type, cache=True)(integrate_samples)
+    return jit_kernel(kernel_type)(integrate_samples)

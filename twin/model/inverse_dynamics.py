@@ -241,7 +241,7 @@ def pull_share(push: float, pull: float) -> float:
     return 0.5 + 0.5 * math.tanh((push + pull) / (PULL_WIDTH * pull))
 
 
-@jit_kernel(_KERNELS, cache=True)
+@jit_kernel(_KERNELS)
 def _force_kernel(
     u: Float1D,
     v: Float1D,

@@ -290,7 +290,6 @@ def reset_extremes(row: Float1D, state: Float1D, params: Float1D) -> None:
         float64[:, :, ::1],
         float64[:, ::1],
     ),
-    cache=True,
 )
 def run_stepped_sine(
     state: Float1D,

@@ -248,7 +248,7 @@ def _exponentiate(angle: Float1D, damping: float) -> Float3D:
     return total
 
 
-@jit_kernel(cache=True)
+@jit_kernel()
 def follow_oscillators(acceleration: Float1D, steps: OscillatorSteps) -> Float2D:
     """Follow oscillators through a record and one period after it; return (frequency, 5) in m/s2.
 
