@@ -14,6 +14,10 @@ folder `runs/<date>-<time>-<name>` is made.
 """
 
 from table_io.errors import InputError
+from twin.archive.catalog import Catalog, update_catalog
+from twin.archive.notes import RunNotes, note_run
+from twin.archive.query import index_runs
+from twin.archive.run_row import RunRow
 from twin.branches.task import BranchOptions, FollowedBranches, follow_branches
 from twin.campaign.simulate_grid import GapOptions, SimulatedGaps, simulate_gaps
 from twin.discovery.decide import DecidedTests, decide
@@ -33,7 +37,6 @@ from twin.log import Log, open_log
 from twin.replay.task import ReplayedLog, replay
 from twin.replay.verify import Verification, repair_log, verify
 from twin.report.compare_command import ComparedRuns, compare_runs
-from twin.report.run_index import RunRow, index_runs
 from twin.rig.calibrate import CalibratedSensor, CalibrationOptions, calibrate
 from twin.rig.check import CheckedTest, check_test
 from twin.rig.check_table import WiringCheckResult, check_table
@@ -47,6 +50,7 @@ __all__ = [
     "BranchOptions",
     "CalibratedSensor",
     "CalibrationOptions",
+    "Catalog",
     "CheckedTest",
     "ComparedRuns",
     "DecideOptions",
@@ -71,6 +75,7 @@ __all__ = [
     "MapOptions",
     "RecordedCurves",
     "ReplayedLog",
+    "RunNotes",
     "RunRow",
     "SimulatedGaps",
     "SimulatedSweeps",
@@ -101,6 +106,7 @@ __all__ = [
     "import_data",
     "import_table",
     "index_runs",
+    "note_run",
     "open_log",
     "open_study",
     "read_curves",
@@ -111,6 +117,7 @@ __all__ = [
     "simulate_gaps",
     "simulate_sweeps",
     "tare",
+    "update_catalog",
     "verify",
     "write_folder_report",
 ]

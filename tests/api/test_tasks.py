@@ -37,6 +37,8 @@ TASKS = {
     "replay": ("replay",),
     "report": ("write_folder_report",),
     "runs": ("index_runs",),
+    "catalog": ("update_catalog",),
+    "note": ("note_run",),
     "simulate": ("simulate",),
     "table-drive": ("compute_drive",),
     "table-twin": ("identify_table",),
@@ -96,7 +98,7 @@ def compare_comparisons(log: Path, folder: Path) -> tuple[object, object]:
     (folder / "python").mkdir()
     compared.write(folder / "python")
     listed = json.loads(call_main("runs", folder, "--json").stdout)["runs"]
-    assert [asdict(run) for run in api.index_runs(folder)] == listed
+    assert [run.to_columns() for run in api.index_runs(folder)] == listed
     returned, written = (
         [(folder / name / file).read_text() for file in ("comparison.json", "compare.html")]
         for name in ("python", "shell")

@@ -18,6 +18,7 @@ TYPED_PYTHON = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["myp
 SOURCES = ("table_io", "twin", "pyproject.toml", "README.md")
 OWNERS = {  # packages that may import a foreign library
     "cryptography": ("twin/security",),
+    "duckdb": ("twin/archive",),
     "google": ("twin/transport",),
     "grpc": ("table_io/backends/ni", "table_io/sim/ni"),
     "h5py": ("table_io/formats",),

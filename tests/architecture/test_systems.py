@@ -9,7 +9,7 @@ import pytest
 from table_io.errors import InputError, require_package
 
 LINUX_ONLY = ("fcntl", "grp", "pty", "pwd", "resource", "termios", "tty")
-EXTRAS = ("h5py", "nidaqmx", "opendaq", "pyarrow", "rerun", "xarray")
+EXTRAS = ("duckdb", "h5py", "nidaqmx", "opendaq", "pyarrow", "rerun", "xarray")
 # Blocks the modules, removes what Windows lacks, then runs each command given as an argument.
 PROGRAM = f"""
 import os, runpy, signal, sys

@@ -28,9 +28,8 @@ from twin.report.report import write_report
 from twin.results.contracts import RunSummary
 from twin.results.recordings import read_recorded_config
 from twin.results.summary import summarise
-from twin.setup.folders import replace_text
 from twin.setup.run_config import RunConfig, make_run_id
-from twin.system.files import hash_file, lock_file
+from twin.system.files import hash_file, lock_file, replace_text
 
 CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 RIG_RECORDS = re.compile(r"^\[(?:\[calibrations\]|tare)\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)

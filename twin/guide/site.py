@@ -82,6 +82,7 @@ CHAPTERS = (
             _page("install", "Install"),
             _page("first-hour", "First hour"),
             _page("laboratory-day", "A laboratory day"),
+            _page("archive", "An archive of runs"),
             _page("while-it-runs", "While a test runs"),
             _page("earthquakes", "Earthquakes"),
             _page("studies", "Studies over parameters"),

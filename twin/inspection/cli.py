@@ -1,4 +1,4 @@
-"""Commands `prc`, `report`, `view`, `runs` and `compare`: what recordings hold."""
+"""Commands `prc`, `report`, `view` and `compare`: what recordings hold."""
 
 import enum
 from pathlib import Path
@@ -82,21 +82,6 @@ def view_command(
     from twin.viewer.command import show_view
 
     show_view(log, save, picture, connect, table, read_keys_option(keys), web)
-
-
-def runs_command(
-    folder: Annotated[
-        Path, typer.Argument(metavar="[FOLDER]", help="Folder that holds runs or a folder runs.")
-    ] = Path(),
-    json: JsonOption = False,
-    page: Annotated[
-        Path | None, typer.Option("--page", help="Also write an index page to this .html file.")
-    ] = None,
-) -> None:
-    """List the runs in a folder: date, test, gap, verdicts, misfit, warnings."""
-    from twin.report.runs_command import print_runs
-
-    print_runs(folder, json, page)
 
 
 def compare_command(

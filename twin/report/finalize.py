@@ -11,15 +11,8 @@ from twin.results.twin_verdict import format_twin_verdict
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import ShownRun
 from twin.system.progress import RunProgress
-from twin.system.terminal import console, print_line
+from twin.system.terminal import VERDICT_COLOURS, console, print_line
 
-VERDICT_COLOURS = {
-    "agrees": "green",
-    "reached": "green",
-    "departs": "red",
-    "missed": "red",
-    "not judged": "yellow",
-}
 EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 

@@ -1,6 +1,5 @@
 """Result folders, whose content is never overwritten, and state files, replaced as a whole."""
 
-import os
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -74,16 +73,6 @@ def claim_folder(folder: Path) -> None:
             value=str(folder),
             remedy="give another folder",
         ) from None
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Replace a file atomically: a reader sees the old or the new one, never a part."""
-    new = path.with_name(f"{path.name}.new")
-    with new.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    new.replace(path)
 
 
 def find_sharing_problem(path: Path, text: str) -> str:

@@ -37,6 +37,16 @@ def hash_file(path: Path) -> str:
         return ""
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Replace a file atomically: a reader sees the old or the new one, never a part."""
+    new = path.with_name(f"{path.name}.new")
+    with new.open("w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    new.replace(path)
+
+
 _locked_folders: dict[Path, int] = {}  # their descriptors, open until this process ends
 
 

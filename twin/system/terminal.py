@@ -16,6 +16,10 @@ from table_io.errors import replace_escapes
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")  # Ctrl-C, kill, a closed window, Ctrl-\\
 ANNOUNCE_AFTER_S = 1.5  # longer than loading from a cache
+VERDICT_COLOURS = {
+    "agrees": "green", "reached": "green", "departs": "red", "missed": "red",
+    "not judged": "yellow",
+}  # fmt: skip
 FILE_COLUMNS = 400  # of output to a file or pipe, where lines need no wrapping
 
 

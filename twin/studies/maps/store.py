@@ -24,11 +24,11 @@ from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
 from twin.laws.library import ENTRY_POINT_GROUP as EFFECT_GROUP
 from twin.results.contract import Contract
-from twin.setup.folders import replace_text
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
 from twin.studies.maps.study import Study, StudyDefinition
+from twin.system.files import replace_text
 from twin.system.versions import find_version_problem, read_installed_versions
 
 COORDINATES = ("seed", "frequency_hz", "direction")  # besides the parameters

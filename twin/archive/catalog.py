@@ -1,0 +1,272 @@
+"""The catalogue of an archive: a row a run in runs.parquet, a row a step in steps.parquet.
+
+A run is read when it is new, or when the size or the time of one of its files changed; its hashes
+then decide whether its rows are made again.
+"""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from table_io.errors import InputError, require_package
+from twin.archive.notes import NOTES_FILE
+from twin.archive.run_row import (
+    COLUMN_TYPES,
+    NUMBER_TYPE,
+    STEP_TYPES,
+    Row,
+    RunRow,
+    replace_nonfinite,
+)
+from twin.recording.run_paths import PARTS_FOLDER
+from twin.report.run_index import find_run_folders
+
+if TYPE_CHECKING:
+    from duckdb import DuckDBPyConnection, DuckDBPyRelation  # of the extra `archive`
+
+CATALOG_FOLDER = "catalog"
+RUNS_FILE, STEPS_FILE = "runs.parquet", "steps.parquet"
+EXTRA = "archive"
+LAYOUT = "1"  # of the rows: a catalogue with another one is made anew
+FIGURES_FOLDER = "figures"
+KEY_TYPES = {"root": "VARCHAR", "folder": "VARCHAR"}
+Key = tuple[str, str]  # root and folder of a run
+
+
+@dataclass(frozen=True, slots=True)
+class Catalog:
+    """The catalogue of an archive, as it was written."""
+
+    folder: Path
+    runs: tuple[RunRow, ...]
+    steps: int
+    read: int  # runs that are new or have changed
+    removed: int  # runs that are no longer there
+
+
+@dataclass(slots=True)
+class _Refreshed:
+    """Rows by run as they are now, and the rows of steps of the runs that were read."""
+
+    rows: dict[Key, Row] = field(default_factory=dict)
+    steps: dict[Key, list[Row]] = field(default_factory=dict)
+    is_changed: bool = False
+
+
+def update_catalog(
+    folders: Sequence[str | Path],
+    out: str | Path | None = None,
+    tell: Callable[[int, int], None] = lambda done, total: None,
+) -> Catalog:
+    """Write the catalogue of all runs in or below folders, and return it.
+
+    It is the folder `out`, by default `catalog` in the one folder. Runs in it that did not change
+    since are not read again. InputError without DuckDB, or if `out` holds something else.
+    """
+    roots = [Path(folder) for folder in folders]
+    for root in roots:
+        if not root.is_dir():
+            raise InputError("no such folder", where=root, remedy="give a folder that holds runs")
+    if out is None and len(roots) > 1:
+        raise InputError(
+            "several folders need a place for their catalogue", key="--out", remedy="name one"
+        )
+    require_package("duckdb", EXTRA, "catalog")
+    folder = roots[0] / CATALOG_FOLDER if out is None else Path(out)
+    is_new = not (folder / RUNS_FILE).is_file()
+    if is_new and folder.exists() and any(folder.iterdir()):
+        raise InputError("holds no catalogue", where=folder, remedy="name a new folder by --out")
+    folder.mkdir(parents=True, exist_ok=True)
+    with open_database() as database:
+        before = {} if is_new else _read_rows(database, folder)
+        names = [os.path.relpath(root.resolve(), folder.resolve()) for root in roots]
+        refreshed = _refresh(folder, names, before, tell)
+        rows = _sort_newest_first(refreshed.rows.values())
+        kept = before.keys() & (refreshed.rows.keys() - refreshed.steps.keys())
+        step_count = _write_steps(database, folder / STEPS_FILE, kept, refreshed)
+        with TemporaryDirectory() as scratch:
+            relation = make_relation(database, rows, COLUMN_TYPES, Path(scratch))
+            _write_parquet(relation, folder / RUNS_FILE)
+    return Catalog(
+        folder,
+        tuple(map(RunRow.from_columns, rows)),
+        step_count,
+        read=len(refreshed.steps),
+        removed=len(before.keys() - refreshed.rows.keys()),
+    )
+
+
+def load_rows(folder: Path, database: "DuckDBPyConnection | None") -> tuple[list[Row], Path | None]:
+    """Return the rows of the runs in a folder, newest first, and the Parquet file that holds them.
+
+    From its catalogue, with what changed since, which is read but not written; the file is None
+    then. Without a catalogue the runs in the folder are read.
+    """
+    catalog = next(
+        (c for c in (folder, folder / CATALOG_FOLDER) if (c / RUNS_FILE).is_file()), None
+    )
+    if catalog is not None and database is not None:
+        before = _read_rows(database, catalog)
+        roots = dict.fromkeys(root for root, _ in before) or {os.pardir: None}
+        refreshed = _refresh(catalog, list(roots), before)
+        rows = _sort_newest_first(refreshed.rows.values())
+        for row in rows:
+            row["folder"] = os.path.relpath(catalog / f"{row['root']}/{row['folder']}", folder)
+        return rows, None if refreshed.is_changed else catalog / RUNS_FILE
+    folders = find_run_folders(folder)
+    return [_read_run(run, str(run.relative_to(folder)))[0].to_columns() for run in folders], None
+
+
+def _read_run(
+    folder: Path, name: str, before: Row | None = None
+) -> tuple[RunRow, list[Row] | None]:
+    from twin.archive.run_reading import read_run  # slow to import, and only for what changed
+
+    return read_run(folder, name, before)
+
+
+def find_archived_runs(root: Path) -> Iterator[tuple[Path, str]]:
+    """Yield (folder, state of its files) of each run in or below a folder, hidden ones apart."""
+    for path, folders, files in os.walk(root):
+        is_run = "run.mcap" in files or PARTS_FOLDER in folders
+        folders[:] = sorted(
+            name for name in folders if not name.startswith(".") and name != FIGURES_FOLDER
+        )
+        if is_run:
+            yield Path(path), _describe_files(path)
+
+
+def _describe_files(folder: str) -> str:
+    """Return size and last change of the files of a run, by which a change of them is noticed."""
+    parts = [LAYOUT]
+    for name in ("run.mcap", "summary.json", NOTES_FILE):
+        try:
+            state = os.stat(os.path.join(folder, name))
+        except OSError:
+            continue
+        parts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
+    return "; ".join(parts)
+
+
+def _refresh(
+    catalog: Path,
+    roots: Iterable[str],
+    before: Mapping[Key, Row],
+    tell: Callable[[int, int], None] = lambda done, total: None,
+) -> _Refreshed:
+    """Return the rows of all runs below the roots, of those that did not change as they were."""
+    refreshed = _Refreshed(is_changed=False)
+    runs = {
+        (root, os.path.relpath(folder, catalog / root)): (folder, files)
+        for root in roots
+        for folder, files in find_archived_runs(Path(os.path.normpath(catalog / root)))
+    }
+    for number, (key, (folder, files)) in enumerate(runs.items(), start=1):
+        row = before.get(key)
+        if row is None or row["files"] != files:
+            is_known = row is not None and str(row["files"]).split(";")[0] == LAYOUT
+            read, steps = _read_run(folder, key[1], row if row and is_known else {})
+            row = replace(read, root=key[0], files=files).to_columns()
+            if steps is not None:
+                refreshed.steps[key] = steps
+            refreshed.is_changed = True
+            tell(number, len(runs))
+        refreshed.rows[key] = row
+    refreshed.is_changed |= refreshed.rows.keys() != before.keys()
+    return refreshed
+
+
+def _sort_newest_first(rows: Iterable[Row]) -> list[Row]:
+    return sorted(rows, key=_find_start, reverse=True)
+
+
+def _find_start(row: Row) -> tuple[float, float]:
+    """Return the start of a run and the last change of its recording, in s since 1970."""
+    changed_s = 0.0
+    for part in str(row["files"]).split("; "):
+        name, _, state = part.partition(" ")
+        if name == "run.mcap":
+            changed_s = float(state.split()[1]) / 1e9
+    try:
+        return datetime.fromisoformat(str(row["started_at"])).timestamp(), changed_s
+    except (ValueError, OverflowError):
+        return changed_s, changed_s
+
+
+def open_database() -> "DuckDBPyConnection":
+    """Return an empty DuckDB database in memory, which fetches no extension from anywhere."""
+    import duckdb
+
+    return duckdb.connect(
+        config={"threads": 1, "autoinstall_known_extensions": False}  # rows are few
+    )
+
+
+def _read_rows(database: "DuckDBPyConnection", catalog: Path) -> dict[Key, Row]:
+    """Return the rows of a catalogue by run; InputError if its file is damaged."""
+    import duckdb
+
+    path = catalog / RUNS_FILE
+    try:
+        cursor = database.execute("SELECT * FROM read_parquet(?)", [str(path)])
+        names = [column[0] for column in cursor.description]
+        rows = [dict(zip(names, values, strict=True)) for values in cursor.fetchall()]
+        return {(row["root"], row["folder"]): row for row in rows}
+    except (duckdb.Error, KeyError) as error:
+        raise InputError(
+            f"no catalogue of runs: {str(error).splitlines()[0]}",
+            where=path,
+            remedy="remove its folder and run `shaketwin catalog` again",
+        ) from None
+
+
+def make_relation(
+    database: "DuckDBPyConnection", rows: Iterable[Row], types: Mapping[str, str], scratch: Path
+) -> "DuckDBPyRelation":
+    """Return rows as a relation of a database; columns without a type hold numbers.
+
+    `scratch` is a folder that must exist as long as the relation.
+    """
+    path = scratch / f"{len(list(scratch.iterdir()))}.ndjson"
+    names = dict.fromkeys(types)
+    with path.open("w", encoding="utf-8") as file:
+        for row in rows:
+            names |= dict.fromkeys(row)
+            file.write(json.dumps(replace_nonfinite(row)) + "\n")
+    columns = {name: types.get(name, NUMBER_TYPE) for name in names}
+    return database.read_json(str(path), format="newline_delimited", columns=columns)
+
+
+def _write_steps(
+    database: "DuckDBPyConnection", path: Path, kept: Iterable[Key], refreshed: _Refreshed
+) -> int:
+    """Write the rows of the steps, of runs that are `kept` as they are; return how many."""
+    rows = (row | {"root": key[0]} for key, steps in refreshed.steps.items() for row in steps)
+    keys: list[Row] = [{"root": root, "folder": folder} for root, folder in kept]
+    with TemporaryDirectory() as folder:
+        scratch = Path(folder)
+        steps = make_relation(database, rows, STEP_TYPES, scratch)
+        if path.is_file():
+            make_relation(database, keys, KEY_TYPES, scratch).create_view("kept")
+            database.read_parquet(str(path)).create_view("old")
+            steps.create_view("fresh")
+            steps = database.sql(
+                "SELECT old.* FROM old SEMI JOIN kept USING (root, folder) "
+                "UNION ALL BY NAME SELECT * FROM fresh"
+            )
+        steps = steps.order("root, folder, step")
+        _write_parquet(steps, path)
+    ((count,),) = database.read_parquet(str(path)).count("*").fetchall()
+    return int(count)
+
+
+def _write_parquet(relation: "DuckDBPyRelation", path: Path) -> None:
+    """Write a relation to a Parquet file, which is replaced as a whole."""
+    new = path.with_name(f"{path.name}.new")
+    relation.write_parquet(str(new))
+    new.replace(path)

@@ -1,0 +1,67 @@
+"""Commands `catalog`, `runs` and `note`: the archive of a laboratory."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from twin.options import JsonOption, LogArgument
+
+WhereOption = Annotated[
+    str | None,
+    typer.Option(
+        "--where",
+        metavar="EXPRESSION",
+        help='Only runs that meet it, as of SQL: "gap_mm = 4 and twin_misfit > 3".',
+    ),
+]
+
+
+def catalog_command(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER...", help="Folders with runs, at any depth.")
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of the catalogue; default: catalog in FOLDER."),
+    ] = None,
+) -> None:
+    """Write a catalogue of runs as Parquet: a row a run, a row a step; reads only what changed."""
+    from twin.archive.command import print_catalog
+
+    print_catalog(folders, out)
+
+
+def runs_command(
+    folder: Annotated[
+        Path, typer.Argument(metavar="[FOLDER]", help="Folder that holds runs or a folder runs.")
+    ] = Path(),
+    json: JsonOption = False,
+    page: Annotated[
+        Path | None, typer.Option("--page", help="Also write an index page to this .html file.")
+    ] = None,
+    where: WhereOption = None,
+    columns: Annotated[
+        bool, typer.Option("--columns", help="Only list the columns that --where knows.")
+    ] = False,
+) -> None:
+    """List the runs in a folder: date, test, gap, verdicts, misfit, warnings."""
+    from twin.archive.command import print_runs
+
+    print_runs(folder, json, page, where, columns)
+
+
+def note_command(
+    run: LogArgument,
+    text: Annotated[
+        str | None, typer.Argument(metavar="[TEXT]", help="New note; an empty text removes it.")
+    ] = None,
+    tag: Annotated[list[str] | None, typer.Option("--tag", help="Add a tag; repeatable.")] = None,
+    untag: Annotated[
+        list[str] | None, typer.Option("--untag", help="Remove a tag; repeatable.")
+    ] = None,
+) -> None:
+    """Note on a run and tag it, in notes.toml next to its recording; without TEXT show both."""
+    from twin.archive.command import print_note
+
+    print_note(run, text, tag or [], untag or [])
