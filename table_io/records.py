@@ -314,6 +314,28 @@ class Level:
 
 
 @dataclass(frozen=True, slots=True)
+class SweepLevel:
+    """Level of a swept sine, over whole cycles that end before sample `index`.
+
+    `frequency_hz` is that in their middle. `reference_m_s2` is the level of the profile,
+    `demanded_m_s2` what limits leave of it, on average over the cycles, and `measured_m_s2` that of
+    the control channels. `limited_by` is the channel that reduces the level, "" if none does.
+    `correction` is the factor on the command. `amplitudes` are fundamentals of `channels`, SI.
+    """
+
+    index: int
+    step: int
+    frequency_hz: float
+    reference_m_s2: float
+    demanded_m_s2: float
+    measured_m_s2: float
+    correction: float
+    limited_by: str
+    channels: tuple[str, ...]
+    amplitudes: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class StepAdded:
     """Step added during the test by an adaptive policy (dwell, track or refine)."""
 
@@ -403,6 +425,7 @@ Record = (
     | Check
     | FrequencyResponse
     | Level
+    | SweepLevel
     | StepAdded
     | OrbitPoint
     | Trip
@@ -456,6 +479,8 @@ def format_record(record: Record, rate_hz: float) -> tuple[str, str] | None:
             return "INFO", f"table FRF gain (acceleration / command): {points}"
         case Level():
             return ("INFO" if record.accepted else "WARN"), _format_level(record)
+        case SweepLevel():
+            return "INFO", _format_sweep_level(record)
         case StepAdded(frequency_hz=frequency, reason=reason):
             return "INFO", f"next step at {frequency:g} Hz: {reason}"
         case OrbitPoint():
@@ -483,6 +508,15 @@ def _format_level(level: Level) -> str:
         f"level at step {level.step}: {level.measured_m_s2 / GRAVITY_M_S2:.4f} g measured, "
         f"{level.demanded_m_s2 / GRAVITY_M_S2:.4f} g demanded; command multiplied by "
         f"{level.correction:.4f} after {level.update} updates"
+    )
+
+
+def _format_sweep_level(level: SweepLevel) -> str:
+    notch = f", reduced by the limit of {level.limited_by}" if level.limited_by else ""
+    return (
+        f"sweep at {level.frequency_hz:.4g} Hz: {level.measured_m_s2 / GRAVITY_M_S2:.4f} g "
+        f"measured, {level.demanded_m_s2 / GRAVITY_M_S2:.4f} g demanded{notch}; command multiplied "
+        f"by {level.correction:.4f}"
     )
 
 

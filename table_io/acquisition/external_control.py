@@ -153,8 +153,16 @@ MAX_STOP_WAIT_S = 10.0  # from a stop request until the recording ends in any ca
 def plan_open_loop_drive(profile: Profile, rig: RigConfig) -> Drive:
     """Return the open-loop drive for an external controller, the loop check included.
 
-    InputError for an adaptive test or a continuation, which decide while they run.
+    InputError for an adaptive test, a swept sine or a continuation, which decide while they run.
     """
+    if profile.swept_sine is not None:
+        raise InputError(
+            "its level is corrected while the frequency moves, which another controller cannot do",
+            where=f"rig {rig.name}",
+            key="excitation.kind",
+            value=profile.excitation.kind,
+            remedy="use a rig that this program drives",
+        )
     if profile.continuation is not None:
         raise InputError(
             "orbits are held by a feedback to the command, which another controller cannot give",

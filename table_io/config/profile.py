@@ -41,6 +41,8 @@ from table_io.config.excitation import (  # those without a use here register th
 )
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.stepped_sine import Sweep
+from table_io.config.excitation.swept_sine import SweptSine
+from table_io.config.limits import NOTCH, LimitConfig
 from table_io.config.tracking import TrackingConfig
 from table_io.errors import InputError
 from table_io.records import Step
@@ -199,6 +201,7 @@ class Profile(ConfigModel):
     loop_check: LoopCheckConfig = LoopCheckConfig()
     control: ControlConfig = ControlConfig()
     protection: ProtectionConfig = ProtectionConfig()
+    limits: tuple[LimitConfig, ...] = Field((), max_length=32, description="On channels.")
     tracking: TrackingConfig = TrackingConfig()
     on_death: OnDeathConfig = OnDeathConfig()
     dwell: DwellConfig | None = None
@@ -229,6 +232,11 @@ class Profile(ConfigModel):
     def continuation(self) -> Continuation | None:
         """Continuation of the test; None if its excitation is of another kind."""
         return self.excitation if isinstance(self.excitation, Continuation) else None
+
+    @property
+    def swept_sine(self) -> SweptSine | None:
+        """Swept sine of the test; None if its excitation is of another kind."""
+        return self.excitation if isinstance(self.excitation, SweptSine) else None
 
     @cached_property
     def plan(self) -> ExcitationPlan:
@@ -265,6 +273,20 @@ class Profile(ConfigModel):
                 remedy="remove [control]",
             )
         return control
+
+    @field_validator("limits")
+    @classmethod
+    def _check_notches(
+        cls, limits: tuple[LimitConfig, ...], info: ValidationInfo
+    ) -> tuple[LimitConfig, ...]:
+        excitation = info.data.get("excitation")
+        has_notch = any(entry.action == NOTCH for entry in limits)
+        if has_notch and excitation is not None and not isinstance(excitation, SweptSine):
+            raise InputError(
+                f"the level of kind {excitation.kind!r} is not reduced while it is played",
+                allowed='action = "warn" or "stop"; "notch" with a swept_sine',
+            )
+        return limits
 
     @field_validator("tracking")
     @classmethod

@@ -12,6 +12,10 @@ velocity. In a segment of it, with s(x) = 6x^5 - 15x^4 + 10x^3 over its length,
 The command uses the corrected level, level * correction, which blends like the level itself.
 `shape` adds harmonics that cancel those of the table: sin(theta) is replaced by sin(theta) + sum
 over k >= 2 of Im(shape_k exp(i k theta)).
+
+In a swept sine f is the quintic polynomial with the values, slopes and curvatures of a logarithmic
+sweep at both ends: df/dt = rate f, d2f/dt2 = rate^2 f. Over a segment it differs from the
+exponential by less than 1e-9, and where a rate is 0 the frequency comes smoothly to a stand.
 """
 
 import math
@@ -64,6 +68,15 @@ RAMP_CYCLES = 2.0  # a soft start over one cycle would peak at 1.12, over two at
 RAMP_S = 0.5
 MAX_BLEND_SLOPE, MAX_BLEND_CURVATURE = 1.875, 5.7736  # of the quintic blend over its length
 MAX_STOP_RATIO = 1.25  # peak acceleration of a history that is stopped, over its own
+# Quintic Hermite polynomials over x = 0 to 1, coefficients of x, x^2 .. x^5: unit slope at the
+# begin and at the end, unit curvature at the begin and at the end, all else 0.
+HERMITE = np.array([
+    [1.0, 0.0, -6.0, 8.0, -3.0],
+    [0.0, 0.0, -4.0, 7.0, -3.0],
+    [0.0, 0.5, -1.5, 1.5, -0.5],
+    [0.0, 0.0, 0.5, -1.0, 0.5],
+])  # fmt: skip
+POWERS = np.arange(1.0, 6.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +98,8 @@ class Segment:
     correction1: float = 1.0
     shape0: tuple[complex, ...] = ()  # orders 2, 3, ... of the command, relative
     shape1: tuple[complex, ...] = ()
+    rate0: float = 0.0  # of a swept sine, 1/s: slope of ln f
+    rate1: float = 0.0
 
     @property
     def end(self) -> int:
@@ -93,7 +108,24 @@ class Segment:
     def phase(self, x: Float1D, rate_hz: float) -> Float1D:
         """Return the phase in cycles at the fractions x of the segment, (x,)."""
         ramp = x**4 * (2.5 + x * (-3.0 + x))
-        return self.phase0 + self.count / rate_hz * (self.f0 * x + (self.f1 - self.f0) * ramp)
+        cycles = self.f0 * x + (self.f1 - self.f0) * ramp
+        if self.rate0 or self.rate1:
+            integral = self.sweep_coefficients(rate_hz) / (POWERS + 1.0)
+            cycles += x * _evaluate_powers(integral, x)
+        return self.phase0 + self.count / rate_hz * cycles
+
+    def frequency(self, x: Float1D, rate_hz: float) -> Float1D:
+        """Return the frequency in Hz at the fractions x of the segment, (x,)."""
+        frequency_hz = self.f0 + (self.f1 - self.f0) * smoothstep(x)
+        if self.rate0 or self.rate1:
+            frequency_hz += _evaluate_powers(self.sweep_coefficients(rate_hz), x)
+        return frequency_hz
+
+    def sweep_coefficients(self, rate_hz: float) -> Float1D:
+        """Return what the rates of a sweep add to f, as coefficients of x .. x^5 in Hz, (5,)."""
+        turns = np.array([self.rate0, self.rate1]) * self.count / rate_hz
+        ends = np.array([self.f0, self.f1])
+        return np.concatenate([turns * ends, turns**2 * ends]) @ HERMITE
 
     def displacement(self, x: Float1D, rate_hz: float) -> Float1D:
         """Return the commanded displacement in m at the fractions x, (x,)."""
@@ -126,7 +158,7 @@ class Segment:
 
     def decay_samples(self, x: float, rate_hz: float) -> int:
         """Return the length of a decay from fraction x: max(2 cycles, 0.5 s) at its frequency."""
-        f = self.f0 + (self.f1 - self.f0) * float(smoothstep(np.array([x]))[0])
+        f = float(self.frequency(np.array([x]), rate_hz)[0])
         return math.ceil(max(RAMP_CYCLES / f, RAMP_S) * rate_hz)
 
 
@@ -204,10 +236,18 @@ class HistorySegment:
         return np.where(inside, self.history_m[np.clip(index, 0, self.count - 1)], 0.0)
 
 
+def _evaluate_powers(coefficients: Float1D, x: Float1D) -> Float1D:
+    """Return the sum of coefficients of x, x^2, ... at x, (x,)."""
+    total = np.zeros(x.size)
+    for coefficient in coefficients[::-1]:
+        total = (total + coefficient) * x
+    return total
+
+
 def segment_displacement(segment: Segment, x: Float1D, rate_hz: float) -> Float1D:
     """Return the commanded displacement in m at the fractions x of a segment, (x,)."""
     s = smoothstep(x)
-    f = segment.f0 + (segment.f1 - segment.f0) * s
+    f = segment.frequency(x, rate_hz)
     low, high = _command_levels(segment)
     theta = 2 * math.pi * segment.phase(x, rate_hz)
     wave = np.sin(theta)
@@ -238,17 +278,24 @@ def _quadratures(
     ds = 30 * x**2 * (1 - x) ** 2 / duration
     dds = 60 * x * (1 - x) * (1 - 2 * x) / duration**2
     df, dl = segment.f1 - segment.f0, levels[1] - levels[0]
-    f, level = segment.f0 + df * s, levels[0] + dl * s
+    f, level = segment.frequency(x, rate_hz), levels[0] + dl * s
     w = 2 * math.pi * f
     g = level / w**2
-    dg = (dl * ds - 2 * level * df * ds / f) / w**2
+    # First and second derivative of what the rates of a sweep add to f.
+    added1, added2 = np.zeros(x.size), np.zeros(x.size)
+    if segment.rate0 or segment.rate1:
+        slopes = segment.sweep_coefficients(rate_hz) * POWERS / duration
+        curvatures = slopes[1:] * POWERS[:-1] / duration
+        added1 = slopes[0] + _evaluate_powers(slopes[1:], x)
+        added2 = curvatures[0] + _evaluate_powers(curvatures[1:], x)
+    dg = (dl * ds - (2 * level * df * ds + 2 * level * added1) / f) / w**2
     ddg = (
         dl * dds
-        - 4 * dl * df * ds**2 / f
-        - 2 * level * df * dds / f
-        + 6 * level * (df * ds / f) ** 2
+        - (4 * dl * df * ds**2 + 4 * dl * ds * added1) / f
+        - (2 * level * df * dds + 2 * level * added2) / f
+        + 6 * level * ((df * ds + added1) / f) ** 2
     ) / w**2
-    dw = 2 * math.pi * df * ds
+    dw = 2 * math.pi * df * ds + 2 * math.pi * added1
     return -dg, -g * w, g * w**2 - ddg, -(2 * dg * w + g * dw)
 
 
@@ -380,8 +427,8 @@ class Drive:
         segment = self.segment_at(index)
         if not isinstance(segment, Segment) or not segment.start <= index < segment.end:
             return 0.0
-        s = float(smoothstep(np.array([(index - segment.start) / segment.count]))[0])
-        return segment.f0 + (segment.f1 - segment.f0) * s
+        x = np.array([(index - segment.start) / segment.count])
+        return float(segment.frequency(x, self.rate_hz)[0])
 
     def level(self, first: int, count: int) -> Float1D:
         """Return the demanded peak acceleration in m/s2, decay included, (count,)."""

@@ -5,11 +5,13 @@ A trajectory is immutable and independent of measurements; `sequencer` decides w
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from table_io.block import Float1D, Label
+from table_io.config.excitation.swept_sine import SweptSine
 from table_io.config.profile import Profile
 from table_io.excitation.drive import (
     RAMP_CYCLES,
@@ -22,6 +24,8 @@ from table_io.excitation.drive import (
 from table_io.records import Step
 
 PEAK_RATIO = 1.05  # largest acceleration of a blend, over the larger level
+SETTLE_UPDATES = 8  # of the level of a swept sine, before its frequency moves
+NOMINAL_UPDATE_S = 1.0  # between updates that change nothing: fewer, longer segments
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +50,7 @@ class Trajectory:
     end: int
     target: SineTarget
     phase: float = 0.0  # in cycles, at `end`
+    log_rate_1_s: float = 0.0  # slope of ln f at `end`, of a swept sine
     segments: tuple[Segment | HistorySegment, ...] = ()
 
     def append_rest(self, count: int) -> "Trajectory":
@@ -84,10 +89,33 @@ class Trajectory:
                 correction1=target.correction,
                 shape0=start.shape,
                 shape1=target.shape,
+                rate0=self.log_rate_1_s,
             )
             if peak_acceleration_ratio(segment, self.rate_hz) <= PEAK_RATIO:
                 return self._append(segment, target)
             duration_s += 0.25 / mean_hz
+
+    def append_sweep(
+        self, target: SineTarget, count: int, step: int, log_rate_1_s: float, label: Label
+    ) -> "Trajectory":
+        """Append `count` samples of a swept sine that end at `target` with this slope of ln f."""
+        start = self.target
+        segment = Segment(
+            self.end,
+            count,
+            label,
+            step,
+            start.frequency_hz,
+            target.frequency_hz,
+            start.level_m_s2,
+            target.level_m_s2,
+            self.phase,
+            correction0=start.correction,
+            correction1=target.correction,
+            rate0=self.log_rate_1_s,
+            rate1=log_rate_1_s,
+        )
+        return self._append(segment, target)
 
     def append_hold(
         self, count: int, step: int, label: Label, cycles: int = 0, settle: int = 0
@@ -137,7 +165,9 @@ class Trajectory:
         x = np.array([(index - last.start) / last.count])
         phase = float(last.phase(x, self.rate_hz)[0]) % 1.0
         target = SineTarget(last.f1, last.level1, last.correction1, last.shape1)
-        return replace(self, end=index, target=target, phase=phase, segments=segments)
+        return replace(
+            self, end=index, target=target, phase=phase, log_rate_1_s=last.rate1, segments=segments
+        )
 
     def to_drive(self, steps: tuple[Step, ...]) -> Drive:
         """Return the drive of the trajectory with a soft stop at its end."""
@@ -153,7 +183,12 @@ class Trajectory:
     def _append(self, segment: Segment, target: SineTarget) -> "Trajectory":
         phase = float(segment.phase(np.ones(1), self.rate_hz)[0]) % 1.0
         return replace(
-            self, end=segment.end, target=target, phase=phase, segments=(*self.segments, segment)
+            self,
+            end=segment.end,
+            target=target,
+            phase=phase,
+            log_rate_1_s=segment.rate1,
+            segments=(*self.segments, segment),
         )
 
 
@@ -183,7 +218,85 @@ def plan_excitation(profile: Profile) -> Drive:
     plan = profile.plan
     if plan.steps:
         return plan_sweep(profile)
+    if profile.swept_sine is not None:
+        return append_whole_sweep(start_trajectory(profile), profile.swept_sine).to_drive(())
     return start_trajectory(profile).append_history(plan.target_m, plan.windows).to_drive(())
+
+
+@dataclass(frozen=True, slots=True)
+class SweptPosition:
+    """Place at the end of a trajectory in a swept sine: pass, frequency, and updates held before.
+
+    The pass is that which goes on; behind the last one it is the number of passes.
+    """
+
+    sweep: int
+    frequency_hz: float
+    held: int = 0
+
+
+def append_swept(
+    trajectory: Trajectory,
+    config: SweptSine,
+    position: SweptPosition,
+    choose_level: Callable[[float], tuple[float, float]],
+    min_s: float = 0.0,
+) -> tuple[Trajectory, SweptPosition]:
+    """Append the next part of a swept sine, to its next update: return (trajectory, position).
+
+    It lasts `min_s` at least. `choose_level` returns (level in m/s2, correction of the command) at
+    a frequency in Hz. At the begin of the first pass the frequency is held for SETTLE_UPDATES.
+    """
+    f, rate_hz = position.frequency_hz, trajectory.rate_hz
+    seconds = max(config.update_s(f), min_s)
+    rate = config.log_rate_1_s(position.sweep)
+    step = config.find_window(position.sweep, f)
+    if position.held < SETTLE_UPDATES:
+        target = SineTarget(f, *choose_level(f))
+        count = math.ceil(seconds * rate_hz)
+        held = replace(position, held=position.held + 1)
+        return trajectory.append_sweep(target, count, step, 0.0, Label.SETTLE), held
+    end_hz = config.ends_hz(position.sweep)[1]
+    left = abs(math.log(end_hz / f))  # of the way in ln f
+    mean = 0.5 * (abs(trajectory.log_rate_1_s) + abs(rate)) / abs(rate)
+    is_last = left <= (mean + 0.5) * abs(rate) * seconds
+    if is_last:  # slow down to a stand; at a stand already, over a part of the way alone
+        share = 0.5 * (abs(trajectory.log_rate_1_s) / abs(rate))
+        seconds = left / (share * abs(rate)) if share else seconds
+        rate = 0.0
+    count = math.ceil(seconds * rate_hz)
+    way = 0.5 * (trajectory.log_rate_1_s + rate) * count / rate_hz
+    next_hz = end_hz if is_last else f * math.exp(way)
+    target = SineTarget(next_hz, *choose_level(next_hz))
+    trajectory = trajectory.append_sweep(target, count, step, rate, Label.MEASURE)
+    after = position.sweep + is_last
+    return trajectory, replace(position, sweep=after, frequency_hz=next_hz)
+
+
+def append_whole_sweep(trajectory: Trajectory, config: SweptSine) -> Trajectory:
+    """Append a swept sine at its nominal level, from its soft start to the end of its passes.
+
+    Of dwells nothing is known before.
+    """
+    trajectory, position = start_swept(trajectory, config, 1.0)
+
+    def choose_level(frequency_hz: float) -> tuple[float, float]:
+        return config.level_m_s2(frequency_hz), 1.0
+
+    while position.sweep < config.passes:
+        trajectory, position = append_swept(
+            trajectory, config, position, choose_level, NOMINAL_UPDATE_S
+        )
+    return trajectory
+
+
+def start_swept(
+    trajectory: Trajectory, config: SweptSine, correction: float
+) -> tuple[Trajectory, SweptPosition]:
+    """Append the soft start of a swept sine at its first frequency: (trajectory, position)."""
+    f = config.ends_hz(0)[0]
+    target = SineTarget(f, config.level_m_s2(f), correction)
+    return trajectory.append_blend(target, 0, RAMP_CYCLES, Label.BLEND), SweptPosition(0, f)
 
 
 def plan_sweep(profile: Profile) -> Drive:

@@ -16,6 +16,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import HarmonicFit, track_channels, track_harmonics
+from table_io.control.sweep_control import combine_levels
 from table_io.safety.consistency import (
     MAX_CELL_OFFSET_RATIO,
     CellPairFit,
@@ -284,10 +285,20 @@ def check_mass_mean(cycle: DriveCycle, swing: SwingAverage) -> Iterator[Suspicio
 
 
 def check_level(cycle: DriveCycle) -> Iterator[Suspicion]:
-    """Compare the fundamental of the table's acceleration with the demanded level."""
-    if not cycle.has("table_acc_m_s2") or cycle.level <= 0.0:
+    """Compare the fundamental of the table's acceleration with the demanded level.
+
+    Of a swept sine it is that of its control channels.
+    """
+    swept = cycle.context.profile.swept_sine
+    names = swept.control_channels if swept is not None else ("table_acc_m_s2",)
+    if not cycle.has(*names) or cycle.level <= 0.0:
         return
     settings, measured = cycle.context.profile.protection, cycle.tones["table_acc_m_s2"].fundamental
+    if swept is not None and cycle.label == Label.MEASURE:
+        rows = np.array([cycle.clean_channel(name) for name in names])
+        fits = track_channels(rows, cycle.phase, TRACKED_HARMONICS)
+        amplitudes = {name: fit.fundamental for name, fit in zip(names, fits, strict=True)}
+        measured = combine_levels(swept, amplitudes, cycle.omega)
     error = measured / cycle.level - 1.0
     message = f"table at {measured:.4g} m/s2, demanded {cycle.level:.4g} m/s2"
     # Before the measured cycles the level may still be converging.

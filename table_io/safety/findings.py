@@ -11,7 +11,7 @@ from table_io.units import GRAVITY_M_S2
 
 # Needed by the controller.
 CONTROL_CHANNELS = frozenset({"drive_disp_m", "table_disp_m", "table_acc_m_s2"})
-MACHINE_ALARM_KINDS = frozenset({"level", "response"})  # all other kinds are sensor faults
+MACHINE_ALARM_KINDS = frozenset({"level", "response", "limit"})  # all other kinds are sensor faults
 # Checks are half a cycle apart, so the first and the last of three share no sample.
 CONFIRMATION_CHECKS = 3
 
@@ -136,7 +136,9 @@ def confirm_suspicion(suspicion: Suspicion, index: int, profile: Profile) -> Fin
 
 def _is_stop(severity: str, channel: str, profile: Profile) -> bool:
     if severity == "sensor":
-        return channel in CONTROL_CHANNELS or profile.protection.sensor == "stop"
+        swept = profile.swept_sine
+        needed = {*CONTROL_CHANNELS, *(swept.control_channels if swept is not None else ())}
+        return channel in needed or profile.protection.sensor == "stop"
     return severity == "stop"
 
 

@@ -268,10 +268,10 @@ def list_noise_margins(
 
 
 def find_amplitude(profile: Profile, frequency_hz: float) -> float:
-    """Return the displacement of a test at a frequency in m; of a history its own peak."""
+    """Return the displacement of a test at a frequency in m; without steps its largest."""
     plan = profile.plan
     if not plan.steps:
-        return float(np.abs(plan.target_m).max())
+        return plan.peak_disp_m
     return plan.level_m_s2 / (2 * math.pi * frequency_hz) ** 2
 
 

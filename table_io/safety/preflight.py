@@ -117,10 +117,25 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
             share = profile.continuation.max_feedback
             peaks_of_step = [_add_feedback(step, largest, share, drive.rate_hz)]
         rows.append(_build_demand(step, peaks_of_step, mass, rig))
+    if profile.swept_sine is not None:
+        rows += _sweep_demands(drive, step_peaks, mass, rig)
     for history in drive.segments:
         if isinstance(history, HistorySegment):
             rows += _history_demands(history, drive.rate_hz, mass, rig)
     return tuple(rows)
+
+
+def _sweep_demands(
+    drive: Drive, peaks: dict[int, list[tuple[float, float, float]]], mass: float, rig: RigConfig
+) -> list[StepDemand]:
+    """Return the demands of each part of a swept sine, named by its frequencies."""
+    rows = []
+    for window, peaks_of_window in sorted(peaks.items()):
+        ends = [f for s in drive.sine_segments if s.step == window for f in (s.f0, s.f1)]
+        d, v, a = (max(values) for values in zip(*peaks_of_window, strict=True))
+        name = f"{min(ends):.3g} to {max(ends):.3g} Hz"
+        rows.append(StepDemand(window, name, math.nan, d, v, a, mass * a, d / rig.output.lsb_m))
+    return rows
 
 
 def _add_feedback(

@@ -8,7 +8,8 @@ acceleration and forces.
     state = start_protection(profile, rig, noise_from(tare_volts, rig.sensors))
     state, findings = inspect_samples(state, Observation.from_drive(block, clipped, drive))
 
-A displacement history has no cycles: of it only the samples are checked.
+A displacement history has no cycles: of it only the samples are checked. The limits of the profile
+on its channels are checked at every sample of every test.
 
 Findings do not depend on how the samples are divided into blocks: the phase of the drive alone
 selects the samples of a cycle check. A fault of a sensor that the
@@ -25,6 +26,7 @@ import numpy as np
 
 from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.config.excitation import History, history_acceleration
+from table_io.config.limits import NOTCH
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_transfer
@@ -39,7 +41,13 @@ from table_io.safety.cycle_checks import (
     ProtectionContext,
     SwingAverage,
 )
-from table_io.safety.findings import Finding, Suspicion, confirm_suspicion, to_finding
+from table_io.safety.findings import (
+    Finding,
+    Suspicion,
+    confirm_suspicion,
+    format_si,
+    to_finding,
+)
 from table_io.safety.sample_checks import (
     HALF_CYCLE,
     LOOP_CHECK_KEY,
@@ -189,6 +197,8 @@ def _check_steady_motion(
     state: CycleCheckState, cycle: DriveCycle
 ) -> tuple[CycleCheckState, list[Suspicion]]:
     """Run the checks for constant frequency and level: level, command, drift, response."""
+    if cycle.context.profile.swept_sine is not None and cycle.label == Label.MEASURE:
+        return _check_swept_motion(state, cycle)
     swing = cycle_checks.update_swing(cycle, state.swing)
     state = replace(state, swing=swing)
     suspicions = [*cycle_checks.check_level(cycle), *cycle_checks.check_command_gain(cycle)]
@@ -213,6 +223,30 @@ def _check_steady_motion(
         )
         state = replace(state, visited_responses=responses)
     return state.update_table_response(table, frequency_hz), suspicions
+
+
+def _check_swept_motion(
+    state: CycleCheckState, cycle: DriveCycle
+) -> tuple[CycleCheckState, list[Suspicion]]:
+    """Run the checks of a steady motion that hold while the frequency moves.
+
+    The band goes beyond that of the servo, so its response is followed, not judged: what it must
+    keep is the level.
+    """
+    suspicions = [
+        *cycle_checks.check_level(cycle),
+        *cycle_checks.check_command_gain(cycle),
+        *cycle_checks.check_table_mean(cycle),
+    ]
+    table_errors = state.pair_baselines.get("table_disp_m", PairBaseline()).errors
+    table, _ = cycle_checks.measure_transfer(cycle, table_errors.low_cut)
+    if suspicions or not math.isfinite(abs(table)):
+        return state, suspicions
+    turn_s = 2 * math.pi / cycle.omega
+    lag_s = cycle_checks.phase_lag_s(table, cycle.omega) % turn_s
+    if lag_s >= MAX_LAG_S:
+        return state, suspicions
+    return replace(state, gain=abs(table), lag_s=lag_s), suspicions
 
 
 def _count_cycles(spans: list[SampleSpan]) -> float:
@@ -247,6 +281,7 @@ MAX_RECORD_RATIO = 1.3  # of the table's acceleration over the envelope of its t
 # less than this share of its peak: impacts and friction add to quiet parts.
 ENVELOPE_S, MIN_ENVELOPE_RATIO = 0.25, 0.5
 HISTORY_KEY = 0.5  # motion without cycles
+NEVER = -(2**62)  # sample before any episode
 HELD_LABELS = (Label.SETTLE, Label.MEASURE, Label.CHECK)
 _LABEL_KEYS = np.array(
     [float(FIRST_HOLD_KEY if label in HELD_LABELS else label != Label.REST) for label in Label]
@@ -298,6 +333,7 @@ class ProtectionState:
     )  # m/s2, from its first sample
     record_samples: int = 0  # of the record that are played
     is_off_target: bool = False  # found once a run
+    last_beyond: tuple[int, ...] = ()  # last sample beyond each limit of the profile
 
 
 def start_protection(
@@ -322,6 +358,7 @@ def start_protection(
         0,
         history,
         record_limit=_limit_record(profile),
+        last_beyond=(NEVER,) * len(profile.limits),
     )
     _warm_up_kernel(state)
     return state
@@ -340,6 +377,37 @@ def _limit_record(profile: Profile) -> Float1D:
     size = np.abs(history_acceleration(profile.plan.target_m, rate_hz))
     envelope = maximum_filter1d(size, 2 * math.ceil(ENVELOPE_S * rate_hz) + 1)
     return MAX_RECORD_RATIO * np.maximum(envelope, MIN_ENVELOPE_RATIO * size.max())
+
+
+def _check_channel_limits(
+    state: ProtectionState, values: Float2D, block: Block
+) -> tuple[ProtectionState, list[Finding]]:
+    """Compare channels with the limits of the profile that warn or stop, once per episode.
+
+    `values` (channel, history + sample); of three samples the median counts, as in other limits.
+    """
+    findings, last_beyond = [], []
+    for entry, last in zip(state.context.profile.limits, state.last_beyond, strict=True):
+        beyond = np.empty(0, dtype=np.int64)
+        if entry.action != NOTCH and entry.channel in block.channels:
+            newest = values[block.channels.index(entry.channel), -len(block) - 2 :]
+            medians = np.median(np.lib.stride_tricks.sliding_window_view(newest, 3), axis=1)
+            beyond = np.flatnonzero(np.abs(medians) > entry.limit_si)
+        before = np.concatenate([[last], block.index + beyond])
+        is_first = np.diff(before) > state.thresholds.episode_samples
+        for row in beyond[is_first].tolist():
+            unit = state.context.rig.channel_by_name[entry.channel].unit
+            value, index = float(medians[row]), block.index + row
+            text = (
+                f"{entry.channel}: {format_si(value, unit)} at sample {index} exceeds the limit of "
+                f"the test, {format_si(entry.limit_si, unit)}"
+            )
+            stop = entry.action == "stop"
+            findings.append(
+                Finding(index, "limit", entry.channel, value, entry.limit_si, text, stop)
+            )
+        last_beyond.append(int(before[-1]))
+    return replace(state, last_beyond=tuple(last_beyond)), findings
 
 
 def _check_record(
@@ -392,9 +460,12 @@ def _warm_up_kernel(state: ProtectionState) -> None:
 def set_response(state: ProtectionState, response: FrequencyResponse) -> ProtectionState:
     """Return the state with the response of the loop check as reference for the table."""
     plan = state.context.profile.plan
+    swept = state.context.profile.swept_sine
     frequency_hz = (
         plan.steps[0].frequency_hz if plan.steps else math.sqrt(plan.low_hz * plan.high_hz)
     )
+    if swept is not None:
+        frequency_hz = swept.ends_hz(0)[0]
     cycle_state = replace(state.cycle_state, response=response)
     return _update_table_response(
         state,
@@ -416,7 +487,7 @@ def inspect_samples(
         np.ascontiguousarray(observation.clipped),
         np.ascontiguousarray(observation.acceleration_m_s2),
     )
-    keys = _motion_keys(block)
+    keys = _motion_keys(block, state.context.profile.swept_sine is not None)
     state = replace(state, sample_state=state.sample_state.copy())
     rows = np.empty((MAX_FINDINGS, 5))
     findings: list[Finding] = []
@@ -447,6 +518,9 @@ def inspect_samples(
             findings += cycle_findings
     state, record_findings = _check_record(state, values, block)
     findings += record_findings
+    if state.last_beyond:
+        state, limit_findings = _check_channel_limits(state, values, block)
+        findings += limit_findings
     tail = slice(len(block), None)
     kept_history = values[:, tail].copy(), command[tail].copy(), phase[tail].copy()
     return replace(state, index=block.end, history=kept_history), tuple(findings)
@@ -478,14 +552,16 @@ def _update_table_response(state: ProtectionState, cycle_state: CycleCheckState)
     )
 
 
-def _motion_keys(block: Block) -> Float1D:
+def _motion_keys(block: Block, is_swept: bool) -> Float1D:
     """Return the key of each sample's motion, (sample,): 0 rest, 1 blend, 2 and up a held step.
 
-    A history has the key HISTORY_KEY: it has no cycles, so there are no cycle checks. Motions
+    A history has the key HISTORY_KEY: it has no cycles, so there are no cycle checks. The parts of
+    a swept sine count as held steps: their frequency moves by a percent in a cycle. Motions
     before the first step have key -1: the loop check judges the sensors itself, so the protection
     must not stop it first.
     """
     keys = _LABEL_KEYS[block.label]
     keys = np.where(keys == FIRST_HOLD_KEY, FIRST_HOLD_KEY + block.step, keys)
-    keys = np.where(block.is_history, HISTORY_KEY, keys)
+    if not is_swept:
+        keys = np.where(block.is_history, HISTORY_KEY, keys)
     return np.where((block.step < 0) & (keys != 0), LOOP_CHECK_KEY, keys)

@@ -10,6 +10,7 @@ ends at rest.
                         tune --(not accepted)-----> blend to the corrected level, tune again
                         hold --(policy decides)---> the next step, or the end
     check --(passes)--> orbit, evaluated and corrected, then release: a continuation (`orbits.py`)
+    check --(passes)--> sweep, updated part by part: a swept sine (`swept_sine.py`)
     check --(passes)--> the end, with a displacement history played as it is, if that is the test
     open: the operator holds the test at its step; on resume the step is tuned and measured again.
 """
@@ -25,6 +26,7 @@ from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import relative_displacement
 from table_io.config.excitation.continuation import Continuation
+from table_io.config.limits import check_limited_channels
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
@@ -34,6 +36,7 @@ from table_io.excitation.drive import Drive, Segment
 from table_io.excitation.trajectory import (
     SineTarget,
     Trajectory,
+    append_whole_sweep,
     cycles_to_samples,
     start_trajectory,
 )
@@ -49,6 +52,11 @@ from table_io.sequencer.orbits import (
     resume_continuation,
 )
 from table_io.sequencer.state import SequencerState, Stage, TestPlan
+from table_io.sequencer.swept_sine import (
+    begin_swept_sine,
+    check_control_channels,
+    decide_sweep_level,
+)
 
 MIN_TUNING_WINDOW_S = 0.3  # shortest evaluation window, rounded up to whole cycles
 MIN_SETTLE_S = 0.3  # from a blend to the window; at least one cycle
@@ -56,10 +64,12 @@ MAX_HOLD_S = 3600.0  # an operator's hold times out after this
 
 
 def begin_excitation(state: SequencerState) -> SequencerState:
-    """Approach the first step, or play the displacement history to its end."""
+    """Approach the first step, begin a swept sine, or play the displacement history to its end."""
     profile, changed = state.plan.profile, state.trajectory.end
     if state.steps:
         return approach_step(state, profile.first_step)
+    if profile.swept_sine is not None:
+        return begin_swept_sine(state)
     plan = profile.plan
     trajectory = state.trajectory.append_history(plan.history_m, plan.windows)
     return replace(
@@ -299,6 +309,7 @@ DECISION_FUNCTIONS: dict[str, Callable[[SequencerState], SequencerState]] = {
     "hold": decide_next_step,
     "orbit": decide_orbit,
     "release": decide_multiplier,
+    "sweep": decide_sweep_level,
 }
 
 DECISION_HORIZON_S = 0.25  # from an evaluation to the change of the command; a block is shorter
@@ -310,6 +321,9 @@ def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> 
     rate = profile.acquisition.rate_hz
     horizon = max(math.ceil(DECISION_HORIZON_S * rate), profile.acquisition.block_samples)
     feedback_horizon = replace_after + math.ceil(FEEDBACK_HORIZON_S * rate)
+    check_limited_channels(profile.limits, rig)
+    if profile.swept_sine is not None:
+        check_control_channels(profile.swept_sine, rig)
     if profile.continuation is not None:
         _check_horizon(profile.continuation, rig, feedback_horizon / rate)
         _check_sensors(rig)
@@ -433,6 +447,10 @@ def nominal_drive(plan: TestPlan) -> Drive:
     """Return the nominal drive: every level accepted at once and no operator command."""
     state = start_test(plan)
     while not state.is_finished:
+        if plan.profile.swept_sine is not None:
+            is_checked = state.stage.kind == "check"
+            trajectory = state.trajectory if is_checked else start_trajectory(plan.profile)
+            return append_whole_sweep(trajectory, plan.profile.swept_sine).to_drive(())
         if state.stage.kind == "check" and plan.profile.continuation is not None:
             state = begin_continuation(state)
         elif state.stage.kind == "check":

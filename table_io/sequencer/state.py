@@ -12,8 +12,8 @@ from table_io.control.amplitude_control import Tuning
 from table_io.control.orbit_feedback import FeedbackState
 from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
-from table_io.excitation.trajectory import Trajectory
-from table_io.records import OrbitPoint, Record, Step
+from table_io.excitation.trajectory import SweptPosition, Trajectory
+from table_io.records import OrbitPoint, Record, Step, SweepLevel
 from table_io.safety.loop_check_data import PreloadLimits
 
 
@@ -35,7 +35,7 @@ class TestPlan:
 class Stage:
     """Next decision; it is made on samples first .. last - 1 once they are acquired."""
 
-    kind: str  # check, tune, hold, orbit, release, open, end
+    kind: str  # check, tune, hold, orbit, release, sweep, open, end
     step: int = -1
     first: int = 0
     last: int = 0
@@ -87,6 +87,21 @@ class OrbitSearch:
     releases: ReleaseSeries | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class SweepSearch:
+    """Swept sine so far: place at the end of the trajectory, and the levels measured.
+
+    Windows begin at sample `since` or later, behind a soft start. `dwells` are the resonances in Hz
+    still ahead, None while the passes last; the present dwell ends at sample `until`.
+    """
+
+    position: SweptPosition
+    since: int
+    levels: tuple[SweepLevel, ...] = ()
+    dwells: tuple[float, ...] | None = None
+    until: int = 0
+
+
 @dataclass(frozen=True)
 class SequencerState:
     """State of a running test; `drive` differs from the previous one from `changed_from` on."""
@@ -104,6 +119,7 @@ class SequencerState:
     blocks: tuple[Block, ...] = ()
     results: tuple[StepResult, ...] = ()
     search: OrbitSearch | None = None
+    sweep: SweepSearch | None = None
     records: tuple[Record, ...] = field(default=())
 
     @property

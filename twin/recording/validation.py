@@ -20,6 +20,7 @@ from table_io.records import (
     RunStart,
     Step,
     StepAdded,
+    SweepLevel,
 )
 from twin.recording.columns import StoredBlock
 
@@ -103,6 +104,8 @@ def _has_unequal_lengths(record: Record) -> bool:
         case Estimate():
             known = record.values, record.sd, record.drift, record.drift_sd
             return any(len(column) != len(record.names) for column in known)
+        case SweepLevel():
+            return len(record.channels) != len(record.amplitudes)
         case OrbitPoint():
             return len(record.u_m) != 2 * len(record.feedback_m)
         case FrequencyResponse():
@@ -126,7 +129,7 @@ def _validate_fields(record: Record) -> str:
                 return f"step = {record.step}, direction = {record.direction[:20]!r}"
             if not 0 < record.frequency_hz <= MAX_FREQUENCY_HZ:
                 return f"frequency_hz = {record.frequency_hz:g}"
-        case OrbitPoint():
+        case OrbitPoint() | SweepLevel():
             is_valid = record.step <= MAX_STEPS and 0 < record.frequency_hz <= MAX_FREQUENCY_HZ
             return "" if is_valid else f"step = {record.step}, {record.frequency_hz:g} Hz"
         case Fault():

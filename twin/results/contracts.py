@@ -387,6 +387,49 @@ class TrackingResult(TrackingError):
     )
 
 
+class SweptPoint(Contract):
+    """Level of a swept sine over a few cycles; all levels are fundamentals."""
+
+    sweep: int = Field(description="pass, or after the last one dwell")
+    direction: Literal["forward", "backward", "dwell"] = Field(description="of the frequency")
+    at_s: Seconds = Field(description="end of the cycles")
+    frequency_hz: Hertz = Field(description="in their middle")
+    reference_m_s2: RealAcceleration = Field(description="level of the profile")
+    demanded_m_s2: RealAcceleration = Field(description="what limits leave of it")
+    achieved_m_s2: RealAcceleration = Field(description="by the control channels")
+    limited_by: str = Field(description="channel whose limit reduces the level; empty: none")
+
+
+class ResonanceEntry(Contract):
+    """Peak of the ratio of the response channel to the level in a pass."""
+
+    sweep: int = Field(description="pass")
+    direction: Direction = Field(description="of the frequency")
+    frequency_hz: Hertz = Field(description="of the peak")
+    amplification: RealRatio = Field(description="fundamental of the response over the level")
+
+
+class SweptSineResult(Contract):
+    """Swept sine: the level against its tolerance over frequency, and what was found."""
+
+    octaves_per_min: RealRatio = Field(description="sweep rate")
+    control_channels: list[str] = Field(description="channels on which the level is measured")
+    strategy: str = Field(description="of several control channels: average or maximum")
+    tolerance: RealRatio = Field(description="of the demanded level, on either side")
+    abort_db: RealSI = Field(description="deviation at which the table stops")
+    passes: int = Field(description="passes that were begun")
+    planned_passes: int = Field(description="passes of the profile")
+    inside: RealRatio = Field(description="share of the time within the tolerance")
+    highest_ratio: RealRatio = Field(description="achieved over demanded, largest")
+    highest_hz: RealHertz = Field(description="frequency of it")
+    lowest_ratio: RealRatio = Field(description="achieved over demanded, smallest")
+    lowest_hz: RealHertz = Field(description="frequency of it")
+    notched: RealRatio = Field(description="share of the time with a reduced level")
+    response_channel: str = Field(description="channel that shows the resonances")
+    resonances: list[ResonanceEntry] = Field(description="of each pass, largest first")
+    points: list[SweptPoint] = Field(description="in order of time")
+
+
 class PlannedOrbitEntry(Contract):
     """Orbit of the twin at a planned point."""
 
@@ -543,6 +586,9 @@ class RunSummary(Contract):
     )
     tracking: TrackingResult | None = Field(
         None, description="of the table, in a displacement history that was measured"
+    )
+    swept_sine: SweptSineResult | None = Field(
+        None, description="level of a swept sine; absent otherwise"
     )
     orbits: list[OrbitResult] | None = Field(
         None, description="of a continuation, in order of measurement; absent otherwise"

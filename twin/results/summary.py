@@ -57,6 +57,7 @@ from twin.results.contracts import (
 )
 from twin.results.excitation_verdict import judge_excitation
 from twin.results.orbits import find_measured_folds, summarise_orbits
+from twin.results.swept_sine import format_swept_sine, summarise_swept_sine
 from twin.results.table_motion import format_tracking, summarise_tracking
 from twin.results.twin_verdict import (
     compare_branches,
@@ -162,13 +163,22 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
         )
         summary.windows = summarise_windows(recording, profile.comparison.contact_n, compare)
         summary.tracking = summarise_tracking(recording, profile)
+    _add_kind_results(summary, recording, profile)
+    summary.excitation_verdict = judge_excitation(summary, profile)
+    summary.twin_verdict = judge_twin(summary)
+    return summary
+
+
+def _add_kind_results(summary: RunSummary, recording: Recording, profile: Profile) -> None:
+    """Add what only some kinds of excitation have: the level of a swept sine, orbits."""
+    if profile.swept_sine is not None:
+        swept = summarise_swept_sine(recording, profile, profile.swept_sine)
+        if swept is not None:
+            summary.swept_sine = swept
     if profile.continuation is not None:
         plan = profile.continuation.orbit_plan
         summary.orbits = summarise_orbits(recording, plan)
         summary.folds = [] if plan.condition == "phase" else find_measured_folds(summary.orbits)
-    summary.excitation_verdict = judge_excitation(summary, profile)
-    summary.twin_verdict = judge_twin(summary)
-    return summary
 
 
 def _describe_run(
@@ -420,6 +430,8 @@ def format_summary(summary: RunSummary, planned: int) -> str:
     if summary.orbits is not None:
         accepted = sum(orbit.accepted for orbit in summary.orbits)
         done = f"{accepted} of {planned} orbits measured"
+    elif summary.swept_sine is not None:
+        done = format_swept_sine(summary.swept_sine)
     elif summary.windows is not None:
         done = f"{len(summary.windows)} windows"
     else:

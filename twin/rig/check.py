@@ -17,6 +17,7 @@ from table_io.config.excitation import history_acceleration
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.excitation.stepped_sine import Sweep
+from table_io.config.excitation.swept_sine import SweptSine
 from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment
 from table_io.safety.loop_check import plan_targets
@@ -141,6 +142,7 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
     return [
         ("specimen", f"{profile.specimen.mass_kg:g} kg, {bumpers}"),
         *_excitation_lines(config),
+        *_limit_lines(profile),
         ("loop check", check),
         ("duration", _format_duration(config)),
         (
@@ -159,7 +161,48 @@ def _excitation_lines(config: RunConfig) -> list[tuple[str, str]]:
     if profile.continuation is not None:
         peak_m_s2 = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
         return _orbit_lines(profile.continuation, peak_m_s2 / GRAVITY_M_S2)
+    if profile.swept_sine is not None:
+        return _swept_sine_lines(profile, profile.swept_sine)
     return _sweep_lines(profile) if profile.steps else _history_lines(profile)
+
+
+def _swept_sine_lines(profile: Profile, config: SweptSine) -> list[tuple[str, str]]:
+    crossover = config.crossover_hz
+    level = f"{profile.plan.level_m_s2 / GRAVITY_M_S2:.4g} g peak"
+    if crossover is not None:
+        level += (
+            f", {config.scale * (config.displacement_mm or 0.0):g} mm amplitude below the "
+            f"crossover at {crossover:.3g} Hz"
+        )
+    measured = f"the {config.strategy} of " if len(config.control_channels) > 1 else ""
+    dwell = (
+        f", then {config.dwell_s:g} s at each resonance of {config.response_channel} above "
+        f"{config.min_amplification:g} times the level"
+        if config.dwell_s
+        else ""
+    )
+    protection = profile.protection
+    return [
+        (
+            "swept sine",
+            f"{config.start_hz:g} to {config.stop_hz:g} Hz, {config.octaves_per_min:g} octaves a "
+            f"minute, {config.passes} passes ({' then '.join(config.directions)}){dwell}",
+        ),
+        (
+            "level",
+            f"{level}, on {measured}{', '.join(config.control_channels)}; alarm at "
+            f"+-{100 * protection.alarm:g} %, stop at +-{protection.abort_db:g} dB",
+        ),
+    ]
+
+
+def _limit_lines(profile: Profile) -> list[tuple[str, str]]:
+    """Return a line with the limits of the test on its channels, if it has some."""
+    texts = [
+        f"{entry.channel} at {entry.limit:g} {entry.unit or 'SI'}: {entry.action}"
+        for entry in profile.limits
+    ]
+    return [("limits", "; ".join(texts))] if texts else []
 
 
 def _orbit_lines(config: Continuation, peak_g: float) -> list[tuple[str, str]]:
@@ -291,6 +334,8 @@ def sum_durations_s(drive: Drive) -> dict[str, float]:
             part = "loop check"
         elif segment.cycles:
             part = "held cycles"
+        elif segment.label == Label.MEASURE:
+            part = "sweep"
         else:
             part = "blends" if segment.label == Label.BLEND else "tuning"
         parts[part] = parts.get(part, 0.0) + segment.count / drive.rate_hz

@@ -27,6 +27,7 @@ from table_io.records import (
     Record,
     SampleGap,
     StepAdded,
+    SweepLevel,
     Timing,
     Trip,
     format_kind,
@@ -67,6 +68,7 @@ class RunProgress:
         self._console = console
         self._steps = steps
         self._orbits = 0  # accepted so far
+        self._sweep_part = -1  # of a swept sine, printed last
         self._latency_ms: float | None = None
         self._bar = Progress(
             TextColumn("[bold]{task.description}"),
@@ -106,6 +108,8 @@ class RunProgress:
             self._print_point(item)
         elif isinstance(item, OrbitPoint):
             self._print_orbit(item)
+        elif isinstance(item, SweepLevel):
+            self._print_sweep(item)
         elif isinstance(item, StepAdded):
             self._steps = max(self._steps, item.step + 1)
         elif isinstance(item, Event):
@@ -139,6 +143,13 @@ class RunProgress:
                 f"{'':>7}  gap: more samples of {name} {gap.reason}; the next are shown after "
                 f"{GAP_SERIES_SAMPLES} valid samples"
             )
+
+    def _print_sweep(self, level: SweepLevel) -> None:
+        """Print the first level of each part of a swept sine."""
+        if level.step != self._sweep_part:
+            self._sweep_part = level.step
+            message = format_record(level, 1.0)
+            self.print_line(f"{level.step:>7}  {message[1] if message else ''}")
 
     def _print_orbit(self, orbit: OrbitPoint) -> None:
         """Print how many of the planned orbits are measured, and the newest."""

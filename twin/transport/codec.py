@@ -48,6 +48,7 @@ from table_io.records import (
     SampleGap,
     Step,
     StepAdded,
+    SweepLevel,
     Timing,
     Trip,
 )
@@ -66,6 +67,7 @@ RECORD_MESSAGES: dict[type, tuple[str, str]] = {
     Check: ("/rig/check", "Check"),
     FrequencyResponse: ("/rig/response", "Response"),
     Level: ("/rig/level", "Level"),
+    SweepLevel: ("/rig/sweep", "SweepLevel"),
     StepAdded: ("/rig/decided", "Decided"),
     OrbitPoint: ("/rig/orbit", "Orbit"),
     Trip: ("/rig/trip", "Trip"),

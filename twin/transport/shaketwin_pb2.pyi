@@ -389,6 +389,32 @@ class Decided(_message.Message):
     run: str
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., acceleration_m_s2: _Optional[float] = ..., reason: _Optional[str] = ..., run: _Optional[str] = ...) -> None: ...
 
+class SweepLevel(_message.Message):
+    __slots__ = ("index", "step", "frequency_hz", "reference_m_s2", "demanded_m_s2", "measured_m_s2", "correction", "limited_by", "channels", "amplitudes", "run")
+    INDEX_FIELD_NUMBER: _ClassVar[int]
+    STEP_FIELD_NUMBER: _ClassVar[int]
+    FREQUENCY_HZ_FIELD_NUMBER: _ClassVar[int]
+    REFERENCE_M_S2_FIELD_NUMBER: _ClassVar[int]
+    DEMANDED_M_S2_FIELD_NUMBER: _ClassVar[int]
+    MEASURED_M_S2_FIELD_NUMBER: _ClassVar[int]
+    CORRECTION_FIELD_NUMBER: _ClassVar[int]
+    LIMITED_BY_FIELD_NUMBER: _ClassVar[int]
+    CHANNELS_FIELD_NUMBER: _ClassVar[int]
+    AMPLITUDES_FIELD_NUMBER: _ClassVar[int]
+    RUN_FIELD_NUMBER: _ClassVar[int]
+    index: int
+    step: int
+    frequency_hz: float
+    reference_m_s2: float
+    demanded_m_s2: float
+    measured_m_s2: float
+    correction: float
+    limited_by: str
+    channels: _containers.RepeatedScalarFieldContainer[str]
+    amplitudes: _containers.RepeatedScalarFieldContainer[float]
+    run: str
+    def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., frequency_hz: _Optional[float] = ..., reference_m_s2: _Optional[float] = ..., demanded_m_s2: _Optional[float] = ..., measured_m_s2: _Optional[float] = ..., correction: _Optional[float] = ..., limited_by: _Optional[str] = ..., channels: _Optional[_Iterable[str]] = ..., amplitudes: _Optional[_Iterable[float]] = ..., run: _Optional[str] = ...) -> None: ...
+
 class Orbit(_message.Message):
     __slots__ = ("index", "step", "frequency_hz", "acceleration_m_s2", "amplitude_m", "u_m", "feedback_m", "noise_m", "command_m", "periods", "updates", "stable", "multiplier", "accepted", "reason", "run", "multiplier_sd")
     INDEX_FIELD_NUMBER: _ClassVar[int]

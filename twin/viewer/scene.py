@@ -47,7 +47,7 @@ class BoxFrames:
 def _table_amplitude(plan: ExcitationPlan) -> float:
     """Return the largest displacement in m of the commanded table motion."""
     if not plan.steps:
-        return float(np.abs(plan.history_m).max())
+        return float(np.abs(plan.history_m).max(initial=plan.swept_disp_m))
     slowest = min(plan.steps, key=lambda step: step.frequency_hz)
     return slowest.acceleration_m_s2 / (2 * math.pi * slowest.frequency_hz) ** 2
 

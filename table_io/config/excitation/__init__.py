@@ -38,8 +38,9 @@ class ExcitationPlan:
 
     `steps` are approached, tuned and measured one by one. Without steps `history_m`, (sample,), is
     played as it is, from rest to rest, open loop and without a phase, in `windows` equal parts;
-    `target_m`, (sample,), is then the displacement that the table should have. The loop check takes
-    its motions from the peak table acceleration and the frequency band.
+    `target_m`, (sample,), is then the displacement that the table should have. A swept sine has
+    neither, but the largest displacement of the table, `swept_disp_m`. The loop check takes its
+    motions from the peak table acceleration and the frequency band.
     """
 
     level_m_s2: float
@@ -50,6 +51,13 @@ class ExcitationPlan:
     target_m: Float1D = field(default_factory=lambda: np.empty(0))
     windows: int = 0
     blend_cycles: float = MIN_BLEND_CYCLES
+    swept_disp_m: float = 0.0
+
+    @property
+    def peak_disp_m(self) -> float:
+        """Largest displacement in m that the table should have."""
+        steps = (s.acceleration_m_s2 / (2 * np.pi * s.frequency_hz) ** 2 for s in self.steps)
+        return float(np.abs(self.target_m).max(initial=max(steps, default=self.swept_disp_m)))
 
 
 class Excitation(ConfigModel):

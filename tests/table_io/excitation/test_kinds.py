@@ -48,6 +48,12 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "half_sine": {"duration_s": 0.2, "acceleration_g": 0.2, "pulses": 2, "windows": 2},
     "chirp": {"start_hz": 1.0, "stop_hz": 8.0, "duration_s": 12.0, "acceleration_g": 0.1},
     "random": {"low_hz": 0.5, "high_hz": 12.0, "rms_g": 0.03, "duration_s": 10.0},
+    "swept_sine": {
+        "start_hz": 1.5,
+        "stop_hz": 3.0,
+        "octaves_per_min": 6.0,
+        "displacement_mm": 4.0,
+    },
     "cyclic": {"protocol": [[5.0, 0.5, 2], [10.0, 1.0, 3]], "windows": 4},
     "pulse_train": {"height_mm": 5.0, "width_s": 0.8, "period_s": 1.5, "windows": 3},
 }
@@ -140,7 +146,10 @@ def test_labels_are_steps_or_windows(kind: str) -> None:
     assert counted.tolist() == sorted(counted.tolist())
     assert set(counted.tolist()) == set(range(len(plan.steps) or plan.windows))
     assert np.array_equal(label == Label.REST, step < 0)
-    if not plan.steps:  # no phase, no cycles, equal windows
+    if kind == "swept_sine":  # a phase, no numbered cycles, parts of equal widths in octaves
+        assert (cycle == -1).all()
+        assert subject.phase(0, subject.planned_end).any()
+    elif not plan.steps:  # no phase, no cycles, equal windows
         assert (cycle == -1).all()
         assert not subject.phase(0, subject.planned_end).any()
         assert np.ptp(np.bincount(counted)) <= 1

@@ -141,7 +141,9 @@ def test_step_that_is_not_played_yet_counts_with_its_held_cycles() -> None:
 def make_controlled(share: float) -> Any:
     """Return a test whose steps are held with feedback of a share of their command."""
     continuation = SimpleNamespace(max_feedback=share)
-    return SimpleNamespace(specimen=make_test().specimen, continuation=continuation)
+    return SimpleNamespace(
+        specimen=make_test().specimen, continuation=continuation, swept_sine=None
+    )
 
 
 def test_feedback_adds_to_every_demand_of_a_step_and_to_no_loop_check() -> None:
