@@ -21,10 +21,10 @@ COARSE: dict[Any, Any] = {
 
 
 class DraftFinder:
-    """Lets `twin.drawing.plot_style` keep its own parameters apart, and draw with coarse ones."""
+    """Lets `twin.drawing.pictures` keep its own parameters apart, and draw with coarse ones."""
 
     def find_spec(self, name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        if name != "twin.drawing.plot_style":
+        if name != "twin.drawing.pictures":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)

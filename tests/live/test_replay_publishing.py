@@ -26,7 +26,7 @@ PATIENCE_S = 60.0
 @pytest.fixture
 def endpoint(monkeypatch: pytest.MonkeyPatch) -> str:
     """A free one; and no report is drawn."""
-    monkeypatch.setattr("twin.report.report.write_report", lambda *_: None)
+    monkeypatch.setattr("twin.report.finalize.write_report", lambda *_: None)
     return free_endpoint()
 
 

@@ -273,7 +273,7 @@ def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return result
 
     monkeypatch.setattr("twin.replay.task.describe_replay", describe)
-    monkeypatch.setattr("twin.report.report.write_report", lambda *_: None)
+    monkeypatch.setattr("twin.report.finalize.write_report", lambda *_: None)
     return kept
 
 

@@ -11,7 +11,7 @@ from unittest.mock import patch
 import pytest
 
 from tests.reports.recordings import blocks, start_record, summary
-from twin.drawing import plot_style
+from twin.drawing import panels, pictures
 from twin.recording.mcap_log import write_items
 from twin.report import figures
 from twin.report.report import load_report_data, render_report
@@ -22,10 +22,10 @@ Maker = Callable[..., Path]
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """A whole run, its pictures and its page, as a user gets them."""
+    """A whole run, the pictures of its figures and its page, as a user gets them."""
 
     folder: Path
-    pictures: list[plot_style.Picture]
+    pictures: list[panels.Picture]
     html: str
 
 
@@ -53,15 +53,17 @@ def drawn_report(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     folder = make(tmp_path_factory.mktemp("drawn"))
     run = load_report_data(folder)
     with draw_in_full_quality():
-        pictures = figures.draw_run_figures(run, folder / "figures")
-        return Drawn(folder, pictures, render_report(run, pictures))
+        drawn = list(figures.draw_figures(run))
+        return Drawn(
+            folder, pictures.save_figures(drawn, folder / "figures"), render_report(run, drawn)
+        )
 
 
 @contextmanager
 def draw_in_full_quality() -> Iterator[None]:
     """Draw as users see it, which `tests/draft` prevents for the sake of time."""
-    full = vars(plot_style).get("FULL_RC_PARAMS", plot_style.RC_PARAMS)
-    with patch.dict(plot_style.RC_PARAMS, dict(full), clear=True):
+    full = vars(pictures).get("FULL_RC_PARAMS", pictures.RC_PARAMS)
+    with patch.dict(pictures.RC_PARAMS, dict(full), clear=True):
         yield
 
 

@@ -13,7 +13,7 @@ from twin.drawing.basin_figures import (
     draw_bifurcation_diagram,
     draw_section,
 )
-from twin.drawing.plot_style import save_figures
+from twin.drawing.pictures import save_figures
 from twin.dynamics.basins import (
     StartGrid,
     compute_basins,

@@ -14,10 +14,11 @@ from table_io.records import Params
 from tests.builders.recordings import store_items
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import STEPS, blocks, one_step, signals, summary
-from twin.drawing.plot_style import PRECOMPRESSION_COLOUR, QuickLayout
+from twin.drawing.pictures import QuickLayout, save_figures
+from twin.drawing.plot_style import PRECOMPRESSION_COLOUR
 from twin.model.parameters import Parameters
 from twin.recording.reader import read_recording
-from twin.report.figures import draw_run_figures
+from twin.report.figures import draw_figures
 from twin.report.report import load_report_data
 from twin.results.contracts import RunSummary
 from twin.results.report_data import (
@@ -107,7 +108,7 @@ def test_precompression_without_a_model(run_folder: Maker, gap: str, known: set[
 def test_precompression_is_drawn_grey(run_folder: Maker, drawn_report: Drawn) -> None:
     items, values = one_step()
     folder = run_folder([Params(0, MODEL, "start"), *items], values, "-1.0")
-    draw_run_figures(build_precompressed(folder), folder / "figures")
+    save_figures(draw_figures(build_precompressed(folder)), folder / "figures")
     grey = int(PRECOMPRESSION_COLOUR[1:3], 16) / 255
     for place, is_marked in ((folder, True), (drawn_report.folder, False)):
         pixels = imread(place / "figures" / "prc.png")[..., :3]

@@ -126,10 +126,10 @@ def test_planned_branch_is_read_from_the_recorded_profile():
     assert read_planned_branch({"sweep": {}}) is None
 
 
-def test_report_shows_branch_and_table(folder, full_quality):
+def test_report_shows_branch_and_table(folder):
     path = write_report(folder[0])
     text = path.read_text(encoding="utf-8")
-    assert (folder[0] / "figures" / "orbits.png").stat().st_size > 10_000
+    assert '<figure id="orbits">' in text
     assert "3.1100" in text
     assert "4.12 ± 0.07" in text
     assert "2 of 3 orbits measured, 1 of them unstable" in text

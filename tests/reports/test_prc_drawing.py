@@ -12,7 +12,7 @@ from tests.reports.recordings import summary
 from twin.compare.curves import PrcJump
 from twin.drawing.plot_style import twin_style
 from twin.drawing.prc_drawing import (
-    Panel,
+    PrcPanel,
     break_at_jumps,
     draw_jumps,
     make_prc_panels,
@@ -29,7 +29,7 @@ def points() -> list[PrcPoint]:
 
 
 @pytest.fixture
-def panels() -> list[Panel]:
+def panels() -> list[PrcPanel]:
     return make_prc_panels(Figure().subplots(2, 2))
 
 
@@ -43,7 +43,7 @@ def test_a_missing_response_leaves_a_gap_in_the_curve(points: list[PrcPoint]) ->
 
 
 def test_left_is_drawn_below_zero_and_amplitudes_start_at_zero(
-    points: list[PrcPoint], panels: list[Panel]
+    points: list[PrcPoint], panels: list[PrcPanel]
 ) -> None:
     plot_prc(panels, partial(extract_prc, points, "twin"), twin_style)
     plot_prc(panels, lambda *_: (np.array([1.0]), np.array([9.0])), twin_style)
@@ -62,7 +62,7 @@ def test_left_is_drawn_below_zero_and_amplitudes_start_at_zero(
 
 @pytest.mark.parametrize(("count", "label"), [(1, "2–2.5 Hz"), (5, "5")])
 def test_jumps_are_labelled_by_frequencies_or_numbers(
-    points: list[PrcPoint], panels: list[Panel], count: int, label: str
+    points: list[PrcPoint], panels: list[PrcPanel], count: int, label: str
 ) -> None:
     jumps = [PrcJump("forward", 2.0, 2.5, "down")] * count
     draw_jumps(panels, partial(extract_prc, points, "twin"), jumps, label_in="eta_d")
@@ -73,7 +73,7 @@ def test_jumps_are_labelled_by_frequencies_or_numbers(
 
 
 def test_a_jump_at_a_frequency_that_was_not_measured_is_left_out(
-    points: list[PrcPoint], panels: list[Panel]
+    points: list[PrcPoint], panels: list[PrcPanel]
 ) -> None:
     jumps = [PrcJump("forward", 2.0, 2.6, "down")]
     draw_jumps(panels, partial(extract_prc, points, "twin"), jumps)

@@ -188,8 +188,8 @@ def test_lost_samples_are_stated_and_the_spectra_are_not(tmp_path: Path) -> None
     summary.write(tmp_path / "summary.json")
     page = write_report(tmp_path, recording).read_text()
     assert "10 samples of the table" in page
-    names = {path.stem for path in (tmp_path / "figures").glob("*.png")}
-    assert names & {*MOTION_FIGURES} == {"table_acceleration", "table_displacement"}
+    names = {name for name in MOTION_FIGURES if f'<figure id="{name}">' in page}
+    assert names == {"table_acceleration", "table_displacement"}
 
 
 def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -
     assert summarise_tracking(late, read_profile(recording)) is None
 
 
-def test_the_report_has_a_section_with_its_figures(run: Run, full_quality: None) -> None:
+def test_the_report_has_a_section_with_its_figures(run: Run) -> None:
     _, recording, summary = run
     table = write_spectrum(recording, 1.2) | {"required_upper": np.inf, "damping": 0.025}
     profile = read_profile(recording, **table)
@@ -222,5 +222,3 @@ def test_the_report_has_a_section_with_its_figures(run: Run, full_quality: None)
     assert "allowed at least 0.9." in section
     assert "at 2.5 % damping" in section
     assert f"{summary.tracking.sa_count} ordinates" in section
-    for name in MOTION_FIGURES:
-        assert (folder / "figures" / f"{name}.png").stat().st_size > 20_000

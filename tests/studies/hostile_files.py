@@ -168,7 +168,7 @@ def call_command(
     kept, argv = reports.write_report, sys.argv
     sys.argv = ["shaketwin", *map(str, words)]
     if not report:
-        reports.write_report = lambda folder, recording=None, more_formats=(): folder
+        reports.write_report = lambda folder, recording=None: folder
     code: object = 0
     message = io.StringIO()
     try:

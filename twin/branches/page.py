@@ -11,17 +11,15 @@ import numpy as np
 from twin.branches.result import BranchDiagram, OrbitEntry
 from twin.drawing.attractor_study import AttractorStudy
 from twin.drawing.branch_curves import (
+    BIFURCATION_MARKERS,
     BranchSet,
     count_impacts,
     describe_bifurcation,
     format_multiplier,
+    period_colour,
     round_to,
 )
-from twin.drawing.branch_figures import (
-    BIFURCATION_MARKERS,
-    draw_branch_figures,
-    period_colour,
-)
+from twin.drawing.branch_figures import draw_branch_figures
 from twin.drawing.page import embed_images, write_page
 from twin.dynamics.continuation import Branch, BranchEnd
 from twin.dynamics.orbits import Orbit

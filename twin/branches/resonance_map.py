@@ -15,15 +15,9 @@ from matplotlib.lines import Line2D
 from table_io.block import Float1D
 from twin.drawing.branch_curves import Axis, make_axis
 from twin.drawing.page import embed_images, write_page
-from twin.drawing.plot_style import (
-    FIGURE_WIDTH_IN,
-    GUIDE_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
-    LineStyle,
-    Picture,
-    save_figures,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import save_figures
+from twin.drawing.plot_style import FIGURE_WIDTH_IN, GUIDE_COLOUR, LineStyle
 from twin.dynamics.main_branches import ResonanceMap
 
 LOCUS_STYLES: dict[str, LineStyle] = {

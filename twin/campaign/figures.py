@@ -12,17 +12,9 @@ from table_io.records import PrcPoint
 from twin.campaign.gap_comparison import GapComparison
 from twin.campaign.gap_figures import draw_gap_figures
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
-from twin.drawing.plot_style import (
-    DIRECTION_COLOURS,
-    GUIDE_COLOUR,
-    TRANSITION_COLOURS,
-    CaptionedFigure,
-    CaptionedFigures,
-    LineStyle,
-    Picture,
-    direction_handles,
-    save_figures,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import direction_handles, save_figures
+from twin.drawing.plot_style import DIRECTION_COLOURS, GUIDE_COLOUR, TRANSITION_COLOURS, LineStyle
 from twin.drawing.prc_families import draw_all_gaps, draw_transition
 from twin.results.excitation_verdict import list_level_errors
 from twin.results.measured_campaign import MeasuredCampaign

@@ -18,7 +18,8 @@ from twin.campaign.gap_comparison import (
     GapComparison,
     format_gap,
 )
-from twin.drawing.plot_style import CaptionedFigure, CaptionedFigures, LineStyle
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.plot_style import LineStyle
 
 FIGURE_SIZE_IN = 11.0, 4.1
 TRADE_OFF_SIZE_IN = 11.0, 5.6

@@ -21,7 +21,7 @@ from twin.campaign.gap_comparison import (
 )
 from twin.campaign.summary import CampaignData, read_campaign
 from twin.drawing.page import embed_images, format_significant, render_page
-from twin.drawing.plot_style import Picture
+from twin.drawing.panels import Picture
 from twin.results.contracts import PeakAndRms, RunSummary
 
 SYMBOLS = {

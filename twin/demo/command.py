@@ -25,15 +25,9 @@ from table_io.sim.ground_truth import (
 from twin.discovery.command import run_discovery
 from twin.discovery.result import Verdict
 from twin.drawing.page import embed_images, render_page
-from twin.drawing.plot_style import (
-    CaptionedFigure,
-    CaptionedFigures,
-    LineStyle,
-    direction_handles,
-    measured_style,
-    save_figures,
-    twin_style,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import direction_handles, save_figures
+from twin.drawing.plot_style import LineStyle, measured_style, twin_style
 from twin.drawing.prc_drawing import break_at_jumps, plot_prc
 from twin.laws.library import find_effect
 from twin.live.run_command import run_test

@@ -30,16 +30,9 @@ from twin.discovery.parameters import GENERIC_PREFIX, TARE_PREFIX
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.result import CandidateResult, DecisiveTest, Verdict
 from twin.discovery.twin_figures import draw_free_running
-from twin.drawing.plot_style import (
-    DIRECTION_COLOURS,
-    FIGURE_WIDTH_IN,
-    GUIDE_COLOUR,
-    TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
-    Picture,
-    save_figures,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import save_figures
+from twin.drawing.plot_style import DIRECTION_COLOURS, FIGURE_WIDTH_IN, GUIDE_COLOUR, TWIN_COLOUR
 
 MAX_LOGS, MAX_BARS, MAX_TICKS = 6, 24, 24
 RIVAL_STYLES = (("#1559b0", "o-"), ("#cf222e", "s--"), ("#1a7f37", "^:"), ("#9a6700", "v-."))

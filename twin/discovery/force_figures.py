@@ -23,14 +23,13 @@ from twin.discovery.figure_data import (
     select_close_ups,
 )
 from twin.discovery.residuals import LogResiduals
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     SIDE_COLOURS,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
 )
 

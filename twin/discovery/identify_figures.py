@@ -11,16 +11,14 @@ from twin.discovery.identify import IdentificationResult
 from twin.discovery.least_squares import INTERVAL_SIGMA
 from twin.discovery.parameters import is_correction
 from twin.discovery.residuals import LogResiduals
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import save_figures
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     SIDE_COLOURS,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
-    Picture,
-    save_figures,
 )
 
 MAX_POINTS = 6000  # of a scatter plot

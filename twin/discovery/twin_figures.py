@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 
 from twin.discovery.figure_data import DiscoveryView, select_close_ups
 from twin.discovery.free_running import MODELS, FreeRuns
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import direction_handles
 from twin.drawing.plot_style import (
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    direction_handles,
     measured_style,
     twin_style,
 )

@@ -13,7 +13,7 @@ from twin.drawing.basin_figures import (
     draw_bifurcation_diagram,
     draw_section,
 )
-from twin.drawing.plot_style import CaptionedFigures
+from twin.drawing.panels import CaptionedFigures
 from twin.dynamics.basins import (
     Basins,
     BifurcationDiagram,

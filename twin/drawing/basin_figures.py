@@ -15,7 +15,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
-from twin.drawing.plot_style import CaptionedFigure
+from twin.drawing.panels import CaptionedFigure
 from twin.dynamics.attractors import Attractor
 from twin.dynamics.basins import Basins, BifurcationDiagram, ChaosRange
 from twin.model.contact_regime import U, V

@@ -8,11 +8,26 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.units import GRAVITY_M_S2
+from twin.drawing.panels import Canvas, Key
+from twin.drawing.plot_style import GUIDE_COLOUR, LineStyle
 from twin.dynamics.bifurcations import Bifurcation
-from twin.dynamics.continuation import Branch
+from twin.dynamics.continuation import Branch, split_by_stability
 from twin.dynamics.orbits import Orbit
 from twin.dynamics.period_map import FREQUENCY, GAP, LEVEL
 
+PERIOD_COLOURS = {
+    1: "#111111", 2: "#1559b0", 3: "#2e9e5b", 4: "#7a3b9b", 5: "#c4161c", 6: "#b3730f",
+}  # fmt: skip
+LONG_PERIOD_COLOUR = "#6b7480"
+CHAOS_COLOUR = "#f3d9e6"
+BIFURCATION_MARKERS: dict[str, LineStyle] = {
+    "fold": {"marker": "s", "mfc": "#c4161c"},
+    "period doubling": {"marker": "^", "mfc": "#1559b0"},
+    "pitchfork": {"marker": "D", "mfc": "#2e9e5b"},
+    "Neimark-Sacker": {"marker": "*", "mfc": "#7a3b9b"},
+    "grazing": {"marker": "o", "mfc": "white"},
+}
+MARKER_SIZE = {"s": 5.5, "^": 6.0, "D": 5.0, "*": 8.5, "o": 5.0}
 Band = tuple[float, float]
 
 
@@ -158,3 +173,64 @@ def round_to(values: Float1D, digits: int = 5) -> list[float | None]:
     return [
         float(f"{value:.{digits}g}") if math.isfinite(value) else None for value in values.tolist()
     ]
+
+
+def period_colour(periods: int) -> str:
+    """Return the color of the branches that repeat after `periods` periods of the drive."""
+    return PERIOD_COLOURS.get(periods, LONG_PERIOD_COLOUR)
+
+
+def plot_branches(
+    ax: Canvas, branches: BranchSet, quantity: BranchQuantity, scale: float = 1.0
+) -> None:
+    """Draw `scale` times a quantity of the branches into `ax`, measured points, chaotic bands."""
+    for low, high in branches.chaotic:
+        factor = branches.axis.factor
+        ax.axvspan(factor * low, factor * high, color=CHAOS_COLOUR, lw=0, zorder=0.4)
+    for curve in branches.measured:
+        ax.plot(
+            curve.x, scale * curve.values[quantity.key], marker="o", ls="", color=curve.colour,
+            ms=5.5, alpha=0.55, mec="none", zorder=1.5,
+        )  # fmt: skip
+    for branch in branches.branches:
+        x, y = branches.x(branch), scale * branches.y(branch, quantity)
+        colour = period_colour(branch.points[0].orbit.periods)
+        for first, last, stable in split_by_stability(branch.stable.tolist()):
+            piece = slice(first, last + 1)
+            style: LineStyle = {"ls": "-", "lw": 1.5} if stable else {"ls": (0, (4, 2.2))}
+            ax.plot(x[piece], y[piece], color=colour, **style)
+        for bifurcation in branch.bifurcations:
+            marker = BIFURCATION_MARKERS[bifurcation.kind]
+            ax.plot(
+                branches.axis.factor * bifurcation.value, y[bifurcation.index], ls="",
+                mec="#111111", mew=0.7, ms=MARKER_SIZE[marker["marker"]], zorder=3, **marker,
+            )  # fmt: skip
+    ax.set_ylabel(quantity.label)
+    ax.set_ylim(bottom=0)
+
+
+def list_branch_keys(branches: BranchSet) -> list[Key]:
+    """Return the legend of `plot_branches`: what is drawn, and nothing else."""
+    periods = sorted({branch.points[0].orbit.periods for branch in branches.branches})
+    kinds = {bifurcation.kind for _, bifurcation in branches.bifurcations}
+    keys = [
+        Key("stable", {"color": GUIDE_COLOUR, "lw": 1.5}),
+        Key("unstable", {"color": GUIDE_COLOUR, "ls": (0, (4, 2.2))}),
+    ]
+    if periods not in ([], [1]):
+        keys += [Key(f"period {n}", {"color": period_colour(n), "lw": 3}) for n in periods]
+    keys += [
+        Key(
+            kind,
+            {"ls": "", "mec": "#111111", "mew": 0.7, "ms": MARKER_SIZE[marker["marker"]]} | marker,
+        )
+        for kind, marker in BIFURCATION_MARKERS.items()
+        if kind in kinds
+    ]
+    if branches.chaotic:
+        keys.append(Key("chaos", {"color": CHAOS_COLOUR}, is_patch=True))
+    keys += [
+        Key(curve.label, {"ls": "", "marker": "o", "color": curve.colour, "alpha": 0.55, "ms": 5.5})
+        for curve in branches.measured
+    ]
+    return keys

@@ -1,16 +1,14 @@
 """Figure of a continuation: branch and multipliers over the twin's, and the feedback's rest."""
 
 import numpy as np
-from matplotlib.figure import Figure
 
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, PanelFigure
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     TWIN_COLOUR,
     UNSTABLE_STYLE,
-    CaptionedFigure,
-    CaptionedFigures,
 )
 from twin.results.orbits import read_planned_branch
 from twin.results.report_data import ReportData
@@ -28,8 +26,9 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     measured = [orbit for orbit in orbits if orbit.multiplier_sd is not None]
     is_backbone = branch is not None and branch.is_backbone
     heights = (2.2, 1.0, 1.2) if measured or is_backbone else (2.2, 1.0)
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.2 if len(heights) == 2 else 8.0))
-    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    size_in = FIGURE_WIDTH_IN, 6.2 if len(heights) == 2 else 8.0
+    figure = PanelFigure(size_in, len(heights), heights=heights)
+    axes = figure.panels[:, 0]
     branch_axis, feedback_axis = axes[:2]
     if branch is not None:
         amplitudes_mm = 1e3 * branch.amplitudes_m
@@ -50,21 +49,23 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         amplitudes = np.array([orbit.amplitude_m for orbit in own])
         shares = np.array([orbit.feedback_share for orbit in own])
         if own:
-            branch_axis.plot(frequencies, 1e3 * amplitudes, "o", color=colour, label=label)
-            feedback_axis.plot(frequencies, 100 * shares, "o", color=colour)
+            branch_axis.plot(
+                frequencies, 1e3 * amplitudes, marker="o", ls="", color=colour, label=label
+            )
+            feedback_axis.plot(frequencies, 100 * shares, marker="o", ls="", color=colour)
     folds = run.summary.folds
     if folds:
         branch_axis.plot(
             [fold.frequency_hz for fold in folds],
             [1e3 * fold.amplitude_m for fold in folds],
-            "x", color=DIRECTION_COLOURS["backward"], label="fold, by its neighbours",
+            marker="x", ls="", color=DIRECTION_COLOURS["backward"], label="fold, by its neighbours",
         )  # fmt: skip
     noise = [
         orbit.noise_m * orbit.feedback_share / orbit.feedback_m if orbit.feedback_m else np.nan
         for orbit in orbits
     ]
     feedback_axis.plot(
-        [orbit.frequency_hz for orbit in orbits], 100 * np.array(noise), "_",
+        [orbit.frequency_hz for orbit in orbits], 100 * np.array(noise), marker="_", ls="",
         color=GUIDE_COLOUR, label="explained by sensor noise",
     )  # fmt: skip
     branch_axis.set_ylabel("amplitude of $u$ in mm")
@@ -74,7 +75,7 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
         axes[2].plot(
             [orbit.frequency_hz for orbit in orbits],
             [orbit.phase_deg for orbit in orbits],
-            "o", color=DIRECTION_COLOURS["forward"],
+            marker="o", ls="", color=DIRECTION_COLOURS["forward"],
         )  # fmt: skip
         axes[2].axhline(90.0, color=GUIDE_COLOUR, lw=0.8)
         axes[2].set_ylabel("phase in degrees")

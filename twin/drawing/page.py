@@ -8,7 +8,7 @@ from typing import Any
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from twin.drawing.plot_style import Picture
+from twin.drawing.panels import Picture
 
 TEMPLATE_DIR = Path(__file__).parent  # contains the shared parts.html and style.html
 

@@ -7,9 +7,9 @@ curves and line styles only.
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
-from matplotlib.axes import Axes
 
 from twin.compare.curves import Hysteresis, PrcJump
+from twin.drawing.panels import Canvas, FigurePanel
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     GUIDE_COLOUR,
@@ -25,7 +25,7 @@ from twin.results.report_data import DIRECTIONS, Curve
 
 Curves = Callable[[str, str], Curve]  # of a direction and a quantity
 Quantities = Mapping[str, int]  # quantities of a panel, each with the sign it is drawn with
-Panel = tuple[Axes, Quantities]
+PrcPanel = tuple[Canvas, Quantities]
 
 ETA_D = (r"$\eta_d$, relative displacement over $u^*$", {"eta_d": 1})
 ETA_A = (r"$\eta_a$, total acceleration over $a^*$", {"eta_a": 1})
@@ -44,7 +44,7 @@ MAX_LABELLED_JUMPS = 4
 
 def make_prc_panels(
     axes: np.ndarray, contents: Iterable[tuple[str, Quantities]] = PRC_PANELS
-) -> list[Panel]:
+) -> list[PrcPanel]:
     """Label a 2D array of axes, one panel per entry of `contents`; return the panels."""
     panels = []
     for ax, (label, quantities) in zip(axes.flat, contents, strict=True):
@@ -57,10 +57,13 @@ def make_prc_panels(
     return panels
 
 
-def format_mirrored_axis(ax: Axes) -> None:
+def format_mirrored_axis(ax: Canvas) -> None:
     """Format a mirrored axis: right side above zero, left below, both labelled positive."""
     ax.axhline(0, color=ZERO_COLOUR, lw=0.7)
-    ax.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
+    if isinstance(ax, FigurePanel):
+        ax.set_absolute_labels()
+    else:
+        ax.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
     for y, va, text in ((0.98, "top", "right"), (0.02, "bottom", "left")):
         ax.text(
             0.99, y, text, transform=ax.transAxes, ha="right", va=va, color=GUIDE_COLOUR, zorder=5,
@@ -68,7 +71,7 @@ def format_mirrored_axis(ax: Axes) -> None:
         )  # fmt: skip
 
 
-def plot_prc(panels: Iterable[Panel], curves: Curves, make_style: DirectionStyle) -> None:
+def plot_prc(panels: Iterable[PrcPanel], curves: Curves, make_style: DirectionStyle) -> None:
     """Draw the curves of both directions in every panel; a curve of one point gets a marker.
 
     Axes that are not mirrored start at zero.
@@ -99,7 +102,7 @@ def break_at_jumps(curves: Curves, jumps: Sequence[PrcJump | Jump]) -> Curves:
 
 
 def shade_hysteresis(
-    panels: Iterable[Panel], intervals: Iterable[Hysteresis | HysteresisInterval]
+    panels: Iterable[PrcPanel], intervals: Iterable[Hysteresis | HysteresisInterval]
 ) -> None:
     """Shade hysteresis intervals, yellow right and cyan left."""
     for ax, _ in panels:
@@ -111,7 +114,7 @@ def shade_hysteresis(
 
 
 def shade_precompression(
-    panels: Iterable[Panel],
+    panels: Iterable[PrcPanel],
     prestress: Mapping[str, float],
     colour: str = GUIDE_COLOUR,
     alpha: float = 1.0,
@@ -128,7 +131,7 @@ def shade_precompression(
 
 
 def draw_jumps(
-    panels: Iterable[Panel], curves: Curves, jumps: Sequence[PrcJump | Jump], label_in: str = ""
+    panels: Iterable[PrcPanel], curves: Curves, jumps: Sequence[PrcJump | Jump], label_in: str = ""
 ) -> None:
     """Draw an arrow per jump in every panel; label them in the panel of the quantity `label_in`.
 

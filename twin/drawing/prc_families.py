@@ -12,6 +12,8 @@ from matplotlib.patches import Patch
 from table_io.records import PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import detect_hysteresis
+from twin.drawing.panels import CaptionedFigure
+from twin.drawing.pictures import direction_handles, label_panel
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     DIRECTION_DASHES,
@@ -20,17 +22,14 @@ from twin.drawing.plot_style import (
     HYSTERESIS_COLOURS,
     REST_LINE_STYLE,
     TRANSITION_COLOURS,
-    CaptionedFigure,
     LineStyle,
-    direction_handles,
     format_minus,
     guide_style,
-    label_panel,
     measured_style,
     twin_style,
 )
 from twin.drawing.prc_drawing import (
-    Panel,
+    PrcPanel,
     draw_jumps,
     make_prc_panels,
     plot_prc,
@@ -56,7 +55,7 @@ HIGHLIGHTED_GAPS = {
 DOT_SIZES_PT = (7.6, 6.8, 6.0, 5.3, 4.7, 4.2, 3.7, 3.2, 2.8)  # from G infinite to G-10
 
 
-def _make_panels(cases: Mapping[str, PaperCase]) -> tuple[Figure, list[Panel]]:
+def _make_panels(cases: Mapping[str, PaperCase]) -> tuple[Figure, list[PrcPanel]]:
     top_hz = max(test.profile.sweep.stop_hz for case in cases.values() for test in case.tests)
     figure = Figure(figsize=(11, 8.2))
     panels = make_prc_panels(figure.subplots(2, 2, sharex=True))
@@ -140,7 +139,7 @@ def _describe_highlights(highlighted: Mapping[str, str], is_measured: bool) -> s
     )
 
 
-def _mark_unit(panels: list[Panel]) -> None:
+def _mark_unit(panels: list[PrcPanel]) -> None:
     """Mark 1.0 in the panels of eta_d and eta_a: u* and a*, continuous in frequency."""
     for ax, _ in panels[:2]:
         ax.axhline(1.0, color=FREE_FLIGHT_COLOUR, ls=(0, (4, 2)), lw=0.9, zorder=0.6)
@@ -169,7 +168,7 @@ def _curve_colour(name: str, direction: str) -> str:
 
 
 def _highlight_hysteresis(
-    panels: list[Panel], points: Sequence[PrcPoint], source: str, kind: str
+    panels: list[PrcPanel], points: Sequence[PrcPoint], source: str, kind: str
 ) -> bool:
     """Draw the primary hysteresis as a band and its jumps as arrows; False if there is none."""
     jumps, intervals = detect_hysteresis(points, source)
@@ -182,7 +181,7 @@ def _highlight_hysteresis(
     return bool(highlighted)
 
 
-def _label_peaks(cases: Mapping[str, PaperCase], panels: list[Panel]) -> None:
+def _label_peaks(cases: Mapping[str, PaperCase], panels: list[PrcPanel]) -> None:
     """Label the primary resonance of each gap with its name."""
     for name, case in cases.items():
         for (ax, _), quantity in zip(panels[:2], ("eta_d", "eta_a"), strict=True):

@@ -7,10 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 
 from twin.drawing.motion_drawing import (
     draw_rest_lines,
@@ -20,15 +16,14 @@ from twin.drawing.motion_drawing import (
     plot_phase_portrait,
     shade_contact,
 )
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, FigurePanel, Key, PanelFigure
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     REST_LINE_STYLE,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
-    direction_handles,
+    direction_keys,
     measured_style,
     twin_style,
 )
@@ -45,24 +40,22 @@ CONTACT_ALPHAS = 0.22, 0.10  # right, left
 BAND_COLOUR = "#cfe8d5"
 
 
-def draw_legend(
-    run: ReportData, figure: Figure, *handles: Line2D | Patch, marker: str = ""
-) -> None:
+def draw_legend(run: ReportData, figure: PanelFigure, *keys: Key, marker: str = "") -> None:
     """Draw the legend of measured and twin lines above the panels."""
-    lines: list[Line2D | Patch] = []
+    lines: list[Key] = []
     directions = [
         direction
         for direction in DIRECTIONS
         if any(step.direction == direction for step in run.steps)
     ]
     if run.source == "measured":
-        lines += direction_handles(
+        lines += direction_keys(
             lambda direction: measured_style(direction) | {"marker": marker},
             "measured ",
             directions,
         )
-    lines += direction_handles(twin_style, "twin ", directions)
-    figure.legend(handles=[*lines, *handles], loc="outside upper center", ncols=6)
+    lines += direction_keys(twin_style, "twin ", directions)
+    figure.legend([*lines, *keys], columns=6)
 
 
 def draw_histories(run: ReportData) -> CaptionedFigures:
@@ -74,11 +67,11 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
             continue
         has_residuals = any(measured and twin for _, measured, twin in motions)
         heights = [2.0, 0.9] * rows if has_residuals else [2.0] * rows
-        figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.8 * sum(heights) + 0.6))
-        axes = figure.subplots(
-            len(heights), len(motions), sharex="col", sharey="row", squeeze=False,
-            height_ratios=heights,
-        )  # fmt: skip
+        size_in = FIGURE_WIDTH_IN, 0.8 * sum(heights) + 0.6
+        figure = PanelFigure(
+            size_in, len(heights), len(motions), sharex="col", sharey="row", heights=heights
+        )
+        axes = figure.panels
         stride = 2 if has_residuals else 1
         for column, (direction, measured, twin) in zip(axes.T, motions, strict=True):
             histories = column[::stride]
@@ -112,10 +105,10 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
             ax.set_ylabel(label)
         for ax in axes[1::2, 0] if has_residuals else ():
             ax.set_ylabel("residual")
-        handles: list[Line2D | Patch] = _gap_line_handles(run)
+        keys = _list_gap_line_keys(run)
         if has_residuals:
-            handles.append(Patch(color=BAND_COLOUR, label="tolerance"))
-        draw_legend(run, figure, *handles)
+            keys.append(Key("tolerance", {"color": BAND_COLOUR}, is_patch=True))
+        draw_legend(run, figure, *keys)
         caption = (
             "Last measured cycles; below each history, measured minus twin in the same unit, and "
             "the tolerance of the restarted twin. Shaded: contact, dark for the right bumper, "
@@ -136,7 +129,7 @@ def _find_bands(run: ReportData, direction: str, hz: float) -> dict[str, float]:
 
 
 def _draw_residuals(
-    axes: Sequence[Axes], measured: StepMotion, twin: StepMotion, bands: dict[str, float]
+    axes: Sequence[FigurePanel], measured: StepMotion, twin: StepMotion, bands: dict[str, float]
 ) -> None:
     """Draw measured minus twin of u, a and the forces, each with its tolerance band."""
     count = min(measured.time.size, twin.time.size)
@@ -155,11 +148,11 @@ def _draw_residuals(
         ax.axhline(0, color=GUIDE_COLOUR, lw=0.5)
 
 
-def _gap_line_handles(run: ReportData) -> list[Line2D | Patch]:
+def _list_gap_line_keys(run: ReportData) -> list[Key]:
     if run.gaps_m is None:
         return []
     name = "bumper at rest" if min(run.gaps_m) >= 0 else "precompression"
-    return [Line2D([], [], **REST_LINE_STYLE, label=name)]
+    return [Key(name, REST_LINE_STYLE)]
 
 
 def draw_loop_figures(run: ReportData) -> CaptionedFigures:
@@ -167,7 +160,7 @@ def draw_loop_figures(run: ReportData) -> CaptionedFigures:
     mass = run.specimen.mass_kg if run.specimen else None
     columns = {hz: motions for hz in select_frequencies(run) if (motions := pair_motions(run, hz))}
 
-    def plot_inertia(ax: Axes, motion: StepMotion, **style: Any) -> None:
+    def plot_inertia(ax: FigurePanel, motion: StepMotion, **style: Any) -> None:
         plot_inertia_loop(ax, motion, mass or np.nan, **style)
 
     yield from _draw_grid(
@@ -206,12 +199,11 @@ def _draw_grid(
     ]
     if not directions:
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * len(directions) + 0.6))
-    axes = figure.subplots(
-        len(directions), max(len(columns), 3), sharex="col", sharey="col", squeeze=False
-    )
-    for ax in axes[:, len(columns) :].flat:
-        ax.remove()
+    size_in = FIGURE_WIDTH_IN, 2.5 * len(directions) + 0.6
+    figure = PanelFigure(size_in, len(directions), max(len(columns), 3), sharex="col", sharey="col")
+    axes = figure.panels
+    axes[:, len(columns) :] = None
+    axes = axes[:, : len(columns)]
     for column, (hz, motions) in zip(axes.T, columns.items(), strict=False):
         for direction, measured, twin in motions:
             ax = column[directions.index(direction)]
@@ -223,15 +215,14 @@ def _draw_grid(
             ):
                 if motion is not None:
                     plot(ax, motion, **style)
-            if not any(np.isfinite(line.get_xydata()).all(axis=1).any() for line in ax.lines[1:]):
+            if not any(np.isfinite(call.arguments).all(axis=0).any() for call in ax.find("plot")):
                 ax.text(
                     0.5, 0.6, "no contact", transform=ax.transAxes, ha="center", color=GUIDE_COLOUR
                 )
-                ax.set_yticks([0])
             if run.gaps_m is not None:
                 draw_rest_lines(run.gaps_m, ax.axvline)
         column[-1].set_xlabel(names[2])
     for ax in axes[:, 0]:
         ax.set_ylabel(names[3])
-    draw_legend(run, figure, *_gap_line_handles(run))
+    draw_legend(run, figure, *_list_gap_line_keys(run))
     yield CaptionedFigure(names[0], names[1], caption, figure)

@@ -4,22 +4,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from table_io.block import Block, Float1D
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, FigurePanel, Key, PanelFigure
 from twin.drawing.plot_style import (
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     measured_style,
     twin_style,
 )
@@ -52,7 +46,7 @@ MOTION_FIGURES = (  # names, in order
 CORRIDOR_COLOUR, REQUIRED_COLOUR = "#8b929c", "#1559b0"
 ACHIEVED_STYLE, TARGET_STYLE = measured_style("forward"), twin_style("forward")
 MAX_PLOTTED_SAMPLES = 20_000
-MAX_DIGITS_RATIO = 1e3  # of a logarithmic axis: up to it 1, 2 and 5 are labelled, not 1 alone
+MIN_FOURIER_SHARE = 1e-5  # of the highest amplitude that is drawn
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +92,8 @@ def draw_table_motion(run: ReportData) -> CaptionedFigures:
 def _draw_acceleration(drawing: MotionDrawing) -> CaptionedFigure:
     """Draw the acceleration over time with a detail around its peak, and what is not the target."""
     motion = drawing.motion
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 6.4))
-    whole, detail, rest = figure.subplots(3, 1, height_ratios=(2.0, 2.0, 1.3))
+    figure = PanelFigure((FIGURE_WIDTH_IN, 6.4), 3, sharex=False, heights=(2.0, 2.0, 1.3))
+    whole, detail, rest = figure.panels[:, 0]
     error = motion.achieved_acc_m_s2 - drawing.late_acc_m_s2
     for axis in (whole, detail):
         _plot_pair(
@@ -142,8 +136,8 @@ def _draw_acceleration(drawing: MotionDrawing) -> CaptionedFigure:
 def _draw_displacement(drawing: MotionDrawing) -> CaptionedFigure:
     """Draw the displacement over time, and what is not the target."""
     motion = drawing.motion
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6))
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.0, 1.0))
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.6), 2, heights=(2.0, 1.0))
+    upper, lower = figure.panels[:, 0]
     achieved, target = 1e3 * motion.achieved_disp_m, 1e3 * drawing.late_disp_m
     _plot_pair(upper, motion.time_s, achieved, target, _stride(motion))
     upper.set_ylabel("displacement\nin mm")
@@ -170,8 +164,8 @@ def _draw_response_spectrum(drawing: MotionDrawing) -> CaptionedFigure:
         ends_hz = required.frequencies_hz[[0, -1]].tolist()
         low_hz, high_hz = min(low_hz, ends_hz[0]), max(high_hz, ends_hz[1])
         high_hz = min(high_hz, MAX_BAND_RATIO * motion.rate_hz)
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 5.6))
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.2, 1.0))
+    figure = PanelFigure((FIGURE_WIDTH_IN, 5.6), 2, heights=(2.2, 1.0))
+    upper, lower = figure.panels[:, 0]
     for per_octave, style in ((FINE_PER_OCTAVE, {"lw": 0.9}), (USUAL_PER_OCTAVE, {"ls": ""})):
         hz = list_octave_frequencies(low_hz, high_hz, per_octave)
         achieved, target = (
@@ -191,10 +185,11 @@ def _draw_response_spectrum(drawing: MotionDrawing) -> CaptionedFigure:
             dots = {"color": ACHIEVED_STYLE["color"], "marker": "o", "ms": 3.6, **style}
             upper.plot(hz, achieved, **dots)
             lower.plot(hz, achieved / target, **dots)
-    handles = [
-        Line2D([], [], **TARGET_STYLE, label="target"),
-        Patch(color=CORRIDOR_COLOUR, alpha=0.35, lw=0, label=f"target ± {100 * SA_TOLERANCE:g} %"),
-        Line2D([], [], color=ACHIEVED_STYLE["color"], lw=0.9, marker="o", label="achieved"),
+    corridor = {"color": CORRIDOR_COLOUR, "alpha": 0.35, "lw": 0}
+    keys = [
+        Key("target", TARGET_STYLE),
+        Key(f"target ± {100 * SA_TOLERANCE:g} %", corridor, is_patch=True),
+        Key("achieved", {"color": ACHIEVED_STYLE["color"], "lw": 0.9, "marker": "o"}),
     ]
     caption = (
         f"Response spectrum of the absolute acceleration at {100 * config.damping:g} % damping. "
@@ -210,39 +205,42 @@ def _draw_response_spectrum(drawing: MotionDrawing) -> CaptionedFigure:
                     required.frequencies_hz, factor * points_g, color=REQUIRED_COLOUR, lw=0.9,
                     ls="--",
                 )  # fmt: skip
-        handles.append(Line2D([], [], color=REQUIRED_COLOUR, lw=1.4, label="required"))
+        keys.append(Key("required", {"color": REQUIRED_COLOUR, "lw": 1.4}))
         caption += " Blue: required spectrum and, dashed, its tolerance."
     upper.set_yscale("log")
     upper.set_ylabel("SA in g")
     lower.set_ylabel("achieved\nover target")
-    _draw_corridor(lower)
+    ratios = [y for call in lower.find("plot") for y in call.arguments[1].tolist()]
+    _draw_corridor(lower, ratios)
     for axis in (upper, lower):
         _format_frequency_axis(axis, low_hz, high_hz)
-        _shade_outside(axis, drawing.band_hz)
+        _shade_outside(axis, (low_hz, high_hz), drawing.band_hz)
     lower.set_xlabel("frequency in Hz")
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    figure.legend(keys, columns=4)
     return CaptionedFigure("table_spectrum", "Response spectrum of the table", caption, figure)
 
 
 def _draw_fourier_and_energy(drawing: MotionDrawing) -> CaptionedFigure:
     """Draw the Fourier amplitude spectra, and the build-up of the Arias intensity."""
     motion = drawing.motion
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
-    spectra, energy = figure.subplots(1, 2, width_ratios=(1.35, 1.0))
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.9), 1, 2, sharex=False, widths=(1.35, 1.0))
+    spectra, energy = figure.panels[0]
+    top = 0.0
     low_hz = drawing.band_hz[0] / BAND_MARGIN
     high_hz = MAX_BAND_RATIO * motion.rate_hz
     for record, style in (
         (motion.achieved_acc_m_s2, ACHIEVED_STYLE),
         (drawing.late_acc_m_s2, TARGET_STYLE),
     ):
-        spectra.loglog(*_smooth_fourier(record, motion.rate_hz, low_hz, high_hz), **style)
+        hz, amplitude = _smooth_fourier(record, motion.rate_hz, low_hz, high_hz)
+        top = max(top, float(amplitude.max(initial=0.0)))
+        spectra.plot(hz, np.maximum(amplitude, MIN_FOURIER_SHARE * top), **style)
         energy.plot(motion.time_s, compute_arias_intensity(record, motion.rate_hz), **style)
-    top = spectra.get_ylim()[1]
-    spectra.set_ylim(max(spectra.get_ylim()[0], 1e-5 * top), top)
+    spectra.set_yscale("log")
     spectra.set_ylabel("Fourier amplitude in m/s")
     spectra.set_xlabel("frequency in Hz")
     _format_frequency_axis(spectra, low_hz, high_hz)
-    _shade_outside(spectra, drawing.band_hz)
+    _shade_outside(spectra, (low_hz, high_hz), drawing.band_hz)
     energy.set_ylabel("Arias intensity in m/s")
     energy.set_xlabel("time in s")
     energy.set_xlim(motion.time_s[0], motion.time_s[-1])
@@ -270,9 +268,10 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
     if not impacts or "measured" not in records:
         return
     hz = list_octave_frequencies(SHOCK_LOW_HZ, MAX_BAND_RATIO * motion.rate_hz, SHOCK_PER_OCTAVE)
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
-    axis = figure.subplots()
-    handles = []
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.9))
+    axis = figure.panels[0, 0]
+    axis.set_yscale("log")
+    keys = []
     for source, record in records.items():
         shock = compute_shock_spectrum(record, motion.rate_hz, hz, DEFAULT_DAMPING)
         wide = source == "measured"
@@ -281,12 +280,12 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
             ("negative", shock.negative_m_s2, "backward"),
         ):
             style = measured_style(direction) if wide else twin_style(direction)
-            axis.loglog(hz, values / GRAVITY_M_S2, **style)
-            handles.append(Line2D([], [], **style, label=f"{source}, {side}"))
+            axis.plot(hz, values / GRAVITY_M_S2, **style)
+            keys.append(Key(f"{source}, {side}", style))
     axis.set_ylabel("SRS in g")
     axis.set_xlabel("natural frequency in Hz")
     _format_frequency_axis(axis, hz[0], hz[-1])
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    figure.legend(keys, columns=4)
     caption = (
         "Shock response spectrum (ISO 18431-4, Q = 10) of the total acceleration of the mass: peak "
         "acceleration of an oscillator mounted on it, to the right (positive) and to the left. Up "
@@ -309,19 +308,16 @@ def _extract_mass_records(run: ReportData, motion: TableMotion) -> Iterator[tupl
 
 
 def _plot_pair(
-    axis: Axes, time_s: Float1D, achieved: Float1D, target: Float1D, stride: int
+    axis: FigurePanel, time_s: Float1D, achieved: Float1D, target: Float1D, stride: int
 ) -> None:
     axis.plot(time_s[::stride], achieved[::stride], **{**ACHIEVED_STYLE, "lw": 2.4})
     axis.plot(time_s[::stride], target[::stride], **TARGET_STYLE)
 
 
-def _add_legend(figure: Figure, achieved: str = "", target: str = "") -> None:
+def _add_legend(figure: PanelFigure, achieved: str = "", target: str = "") -> None:
     """Add the legend of the pair, with what follows either name."""
-    handles = [
-        Line2D([], [], **ACHIEVED_STYLE, label=f"achieved{achieved}"),
-        Line2D([], [], **TARGET_STYLE, label=f"target{target}"),
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=2)
+    keys = [Key(f"achieved{achieved}", ACHIEVED_STYLE), Key(f"target{target}", TARGET_STYLE)]
+    figure.legend(keys, columns=2)
 
 
 def _stride(motion: TableMotion) -> int:
@@ -360,35 +356,25 @@ def _smooth_fourier(
     return np.sqrt(edges[:-1] * edges[1:])[present], np.sqrt(sums[present] / counts[present])
 
 
-def _draw_corridor(axis: Axes) -> None:
+def _draw_corridor(axis: FigurePanel, ratios: list[float]) -> None:
     axis.axhspan(1 - SA_TOLERANCE, 1 + SA_TOLERANCE, color=CORRIDOR_COLOUR, alpha=0.35, lw=0)
     axis.axhline(1.0, color=TWIN_COLOUR, lw=0.8)
-    low, high = axis.get_ylim()
-    axis.set_ylim(min(low, 1 - 2 * SA_TOLERANCE), max(high, 1 + 2 * SA_TOLERANCE))
+    low, high = min(ratios), max(ratios)
+    margin = 0.05 * (high - low)
+    axis.set_ylim(min(low - margin, 1 - 2 * SA_TOLERANCE), max(high + margin, 1 + 2 * SA_TOLERANCE))
 
 
-def _shade_outside(axis: Axes, band_hz: tuple[float, float]) -> None:
+def _shade_outside(
+    axis: FigurePanel, shown_hz: tuple[float, float], band_hz: tuple[float, float]
+) -> None:
     """Shade the frequencies beyond the band of interest."""
-    low, high = axis.get_xlim()
+    low, high = shown_hz
     for first, last in ((low, band_hz[0]), (band_hz[1], high)):
         if first < last:
             axis.axvspan(first, last, color=GUIDE_COLOUR, alpha=0.07, lw=0)
 
 
-def _format_frequency_axis(axis: Axes, low_hz: float, high_hz: float) -> None:
-    """Give an axis a logarithmic frequency, and plain numbers on both."""
+def _format_frequency_axis(axis: FigurePanel, low_hz: float, high_hz: float) -> None:
+    """Give an axis a logarithmic frequency."""
     axis.set_xscale("log")
     axis.set_xlim(low_hz, high_hz)
-    axis.xaxis.set_minor_formatter(NullFormatter())
-    if axis.get_yscale() == "log":
-        low, high = axis.get_ylim()
-        digits = (1.0, 2.0, 5.0) if high < MAX_DIGITS_RATIO * low else (1.0,)
-        axis.yaxis.set_major_locator(LogLocator(subs=digits))
-        axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.yaxis.set_minor_formatter(NullFormatter())
-    ticks = [hz for hz in _list_ticks() if low_hz <= hz <= high_hz]
-    axis.set_xticks(ticks, [f"{hz:g}" for hz in ticks])
-
-
-def _list_ticks() -> list[float]:
-    return [digit * 10.0**power for power in range(-3, 5) for digit in (1, 2, 5)]

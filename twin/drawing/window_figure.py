@@ -3,17 +3,15 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from table_io.block import Block, Float1D
 from table_io.channels import contact_forces, relative_displacement
 from twin.drawing.motion_drawing import draw_rest_lines
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, PanelFigure
 from twin.drawing.plot_style import (
     FIGURE_WIDTH_IN,
     GUIDE_COLOUR,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     measured_style,
     twin_style,
 )
@@ -39,8 +37,9 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
     rows = 4 if run.has_bumpers else 3
     strips = RESIDUALS if run.source == "measured" and twin else ()
     heights = [2.0] * rows + [1.0] * len(strips)
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 0.88 * sum(heights) + 0.5))
-    axes = figure.subplots(len(heights), 1, sharex=True, height_ratios=heights)
+    size_in = FIGURE_WIDTH_IN, 0.88 * sum(heights) + 0.5
+    figure = PanelFigure(size_in, len(heights), heights=heights)
+    axes = figure.panels[:, 0]
     sources = [(twin, twin_style("forward"))]
     if run.source == "measured":
         sources.insert(0, (measured, measured_style("forward")))

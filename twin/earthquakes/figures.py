@@ -12,7 +12,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MultipleLocator, NullFo
 from scipy import signal
 
 from table_io.block import Float1D
-from twin.drawing.plot_style import GUIDE_COLOUR, RC_PARAMS, measured_style, twin_style
+from twin.drawing.pictures import RC_PARAMS
+from twin.drawing.plot_style import GUIDE_COLOUR, measured_style, twin_style
 from twin.earthquakes.table_identification import HIGHEST_HZ, LOWEST_HZ, TableRehearsal
 from twin.earthquakes.table_response import PredictiveModel
 

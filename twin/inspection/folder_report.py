@@ -4,16 +4,13 @@ from pathlib import Path
 
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
-from twin.campaign.report import write_campaign_report
 from twin.recording.merge import merge_run_parts
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.report.pdf_report import write_pdf_report
+from twin.report.figures import draw_figures
 from twin.report.report import load_report_data, write_report
 from twin.results.recordings import open_recording, read_recorded_config
 from twin.results.summary import summarise
 from twin.studies import DEFINITION_FILE, TABLE_FILE
-from twin.studies.maps.page import write_map_page
-from twin.studies.page import write_study_page
 from twin.system.terminal import print_line
 
 FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
@@ -34,22 +31,35 @@ def write_folder_report(
         merge_run_parts(folder)
     if as_pdf or all_formats:
         _require_run(folder, "--format pdf" if as_pdf else "--figures")
+    # What draws pictures is slow to import: the report of a run waits for none of it.
     if (folder / STATE_FILE).is_file():
+        from twin.campaign.report import write_campaign_report
+
         return (write_campaign_report(folder),)
     if (folder / TABLE_FILE).is_file():
+        from twin.studies.page import write_study_page
+
         return (write_study_page(folder),)
     if (folder / DEFINITION_FILE).is_file():
+        from twin.studies.maps.page import write_map_page
+
         return (write_map_page(folder),)
     recording = open_recording(folder)
     if not (folder / "summary.json").exists():
         summary = summarise(recording, read_recorded_config(recording).parameters)
         summary.write(folder / "summary.json")
-    page = write_report(folder, recording, FIGURE_FORMATS if all_formats else ())
-    if not as_pdf:
-        return (page,)
-    path = folder / "report.pdf"
-    write_pdf_report(load_report_data(folder, recording), path)
-    return page, path
+    pages = [write_report(folder, recording)]
+    if all_formats:
+        from twin.drawing.pictures import save_figures
+
+        figures = draw_figures(load_report_data(folder, recording))
+        save_figures(figures, folder / "figures", more_formats=FIGURE_FORMATS)
+    if as_pdf:
+        from twin.report.pdf_report import write_pdf_report
+
+        pages.append(folder / "report.pdf")
+        write_pdf_report(load_report_data(folder, recording), pages[-1])
+    return tuple(pages)
 
 
 def print_report(folder: Path, as_pdf: bool, all_formats: bool) -> None:

@@ -12,19 +12,17 @@ from twin.drawing.motion_drawing import (
     plot_inertia_loop,
     shade_contact,
 )
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import direction_handles, label_panel
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     GAP_COLOURS,
     GUIDE_COLOUR,
     REST_LINE_STYLE,
     UNSTABLE_STYLE,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    direction_handles,
     experiment_style,
     format_minus,
-    label_panel,
 )
 from twin.paper.findings import find_coexisting_orbits
 from twin.paper.study import COEXISTING_HZ, PaperStudy

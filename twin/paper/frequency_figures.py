@@ -14,21 +14,19 @@ from twin.drawing.motion_drawing import (
     plot_phase_portrait,
     shade_contact,
 )
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import direction_handles, label_panel
 from twin.drawing.plot_style import (
     GUIDE_COLOUR,
     HYSTERESIS_COLOURS,
     REST_LINE_STYLE,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    direction_handles,
     experiment_style,
-    label_panel,
     measured_style,
     twin_style,
 )
-from twin.drawing.prc_drawing import ETA_A, ETA_D, Panel, make_prc_panels, plot_prc
+from twin.drawing.prc_drawing import ETA_A, ETA_D, PrcPanel, make_prc_panels, plot_prc
 from twin.paper.low_frequency import simulate_secondary_motion
 from twin.paper.study import CHAOS_SCAN_HZ, DETAIL_HZ, SECONDARY_HZ, PaperStudy
 from twin.results.measured_campaign import MeasuredCampaign
@@ -152,7 +150,7 @@ def _plot_motion(
 
 
 def _draw_prc(
-    panels: list[Panel],
+    panels: list[PrcPanel],
     case: PaperCase,
     campaign: MeasuredCampaign | None,
     detail_hz: list[float],

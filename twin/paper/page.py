@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from twin.drawing.page import embed_images, write_page
-from twin.drawing.plot_style import CaptionedFigures, Picture, save_figures
+from twin.drawing.panels import CaptionedFigures, Picture
+from twin.drawing.pictures import save_figures
 from twin.drawing.prc_families import draw_all_gaps, draw_transition
 from twin.model.config import ModelConfig
 from twin.paper.force_loops import draw_paper_loop_figures

@@ -16,15 +16,13 @@ from twin.drawing.motion_drawing import (
     plot_phase_portrait,
     shade_contact,
 )
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import direction_handles, label_panel
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     GUIDE_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    direction_handles,
     experiment_style,
-    label_panel,
     measured_style,
 )
 from twin.drawing.prc_drawing import ETA_A, make_prc_panels, plot_prc

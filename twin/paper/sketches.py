@@ -5,15 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from twin.drawing.plot_style import (
-    GUIDE_COLOUR,
-    REST_LINE_STYLE,
-    SIDE_COLOURS,
-    CaptionedFigure,
-    CaptionedFigures,
-    LineStyle,
-    label_panel,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import label_panel
+from twin.drawing.plot_style import GUIDE_COLOUR, REST_LINE_STYLE, SIDE_COLOURS, LineStyle
 from twin.paper.study import PaperStudy
 from twin.results.measured_campaign import MeasuredCampaign
 

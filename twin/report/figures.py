@@ -1,23 +1,20 @@
 """Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12."""
 
-from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
-from matplotlib.ticker import MaxNLocator
 
 from table_io.block import Block
 from table_io.units import GRAVITY_M_S2
-from twin.drawing.branch_curves import FREE_QUANTITIES, BranchSet
-from twin.drawing.branch_figures import branch_handles, plot_branches
+from twin.drawing.branch_curves import (
+    FREE_QUANTITIES,
+    BranchSet,
+    list_branch_keys,
+    plot_branches,
+)
 from twin.drawing.motion_drawing import draw_rest_lines
 from twin.drawing.orbit_figure import draw_orbits
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, FigurePanel, Key, PanelFigure
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     FIGURE_WIDTH_IN,
@@ -25,12 +22,8 @@ from twin.drawing.plot_style import (
     HYSTERESIS_COLOURS,
     PRECOMPRESSION_COLOUR,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    Picture,
     measured_style,
-    save_figures,
     twin_style,
 )
 from twin.drawing.prc_drawing import (
@@ -62,20 +55,6 @@ from twin.results.report_data import (
 MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincide
 
 
-def draw_run_figures(
-    run: ReportData, folder: Path, more_formats: Sequence[str] = ()
-) -> list[Picture]:
-    """Draw all figures for which the run has data into PNG files; return them in report order.
-
-    `more_formats`: see `save_figures`.
-    """
-    for stale in folder.glob("histories_*hz.*"):
-        stale.unlink()
-    # No exponent above an axis is in the way of a title: searching its place takes a tenth of all.
-    with mpl.rc_context({"axes.titley": 1.0}):
-        return save_figures(draw_figures(run), folder, more_formats=more_formats)
-
-
 def draw_figures(run: ReportData) -> CaptionedFigures:
     """Yield all figures for which the run has data, in report order."""
     for draw in (
@@ -101,9 +80,8 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     if not any(np.isfinite(curves(direction, "eta_d")[1]).any() for direction in DIRECTIONS):
         return
     contents = PRC_PANELS if run.has_bumpers else FREE_PANELS
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
-    axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
-    panels = make_prc_panels(axes, contents)
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3), len(contents) // 2, 2)
+    panels = make_prc_panels(figure.panels, contents)
     intervals = run.summary.hysteresis
     prestress = compute_prestress(run)
     shade_hysteresis(panels, intervals)
@@ -114,14 +92,11 @@ def _draw_prc(run: ReportData) -> CaptionedFigures:
     plot_prc(panels, break_at_jumps(twin, twin_jumps), twin_style)
     draw_jumps(panels, curves, jumps, label_in="eta_d")
     kinds = sorted({interval.kind for interval in intervals})
-    patches = [Patch(color=HYSTERESIS_COLOURS[kind], label=f"{kind} hysteresis") for kind in kinds]
+    patches = {f"{kind} hysteresis": HYSTERESIS_COLOURS[kind] for kind in kinds}
     if prestress:
-        patches.append(
-            Patch(
-                fc=PRECOMPRESSION_COLOUR, ec=GUIDE_COLOUR, ls="--", lw=0.8, label="precompression"
-            )
-        )
-    draw_legend(run, figure, *patches, marker="o")
+        patches["precompression"] = PRECOMPRESSION_COLOUR
+    keys = [Key(label, {"color": colour}, is_patch=True) for label, colour in patches.items()]
+    draw_legend(run, figure, *keys, marker="o")
     caption = (
         "One point per frequency step, averaged over its measured cycles; measured wide and pale, "
         "twin thin. Curves are broken where they jump; arrows: jumps between two grid frequencies. "
@@ -139,20 +114,20 @@ def _draw_model_branches(run: ReportData) -> CaptionedFigures:
     if branches is None or stars is None:
         return
     scales = dict(zip(("eta_d", "eta_a"), stars, strict=True))
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.9))
-    axes = figure.subplots(1, 2, sharex=True, squeeze=False)
-    panels = make_prc_panels(axes, FREE_PANELS)
-    for (ax, quantities), quantity in zip(panels, FREE_QUANTITIES, strict=True):
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.9), 1, 2)
+    styles = {direction: {**_dotted_style(direction), "ls": ""} for direction in DIRECTIONS}
+    panels = make_prc_panels(figure.panels, FREE_PANELS)
+    for (ax, quantities), (label, _), quantity in zip(
+        panels, FREE_PANELS, FREE_QUANTITIES, strict=True
+    ):
         (name,) = quantities
-        label = ax.get_ylabel()
         plot_branches(ax, branches, quantity, scale=quantity.si / scales[name])
         ax.set_ylabel(label)
-        for direction in DIRECTIONS:
+        for direction, style in styles.items():
             f, y = extract_prc(run.steps, run.source, direction, name)
-            style = {**_dotted_style(direction), "ls": ""}
-            ax.plot(f, y, zorder=1.5, label=f"{run.source} {direction}", **style)
-    handles = [*axes[0, 0].get_legend_handles_labels()[0], *branch_handles(branches)]
-    figure.legend(handles=handles, loc="outside upper center", ncols=7)
+            ax.plot(f, y, zorder=1.5, **style)
+    keys = [Key(f"{run.source} {direction}", style) for direction, style in styles.items()]
+    figure.legend([*keys, *list_branch_keys(branches)], columns=7)
     yield CaptionedFigure(
         "model_branches",
         "Branches of the model",
@@ -194,35 +169,29 @@ def _draw_impacts(run: ReportData) -> CaptionedFigures:
     ]
     if not run.has_bumpers or not any(np.isfinite(count).any() for count in counts):
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.3 * len(directions) + 0.4))
-    rows = figure.subplots(len(directions), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    size_in = FIGURE_WIDTH_IN, 2.3 * len(directions) + 0.4
+    figure = PanelFigure(size_in, len(directions), sharey="all")
+    twin_dots = {"marker": "o", "ms": 6.5, "mfc": "none", "mec": TWIN_COLOUR, "mew": 0.8, "ls": ""}
+    measured_dots = {
+        direction: {"color": DIRECTION_COLOURS[direction], "marker": "o", "ls": ""}
+        for direction in directions
+    }
+    rows = figure.panels[:, 0]
     for ax, direction in zip(rows, directions, strict=True):
         for side, sign in zip(IMPACT_KEYS, (1, -1), strict=True):
             f, y = extract_prc(run.steps, "measured", direction, side)
             ax.vlines(f, 0, sign * y, color=DIRECTION_COLOURS[direction], lw=3, alpha=0.35)
-            ax.plot(f, sign * y, "o", color=DIRECTION_COLOURS[direction])
+            ax.plot(f, sign * y, **measured_dots[direction])
             f, y = extract_prc(run.steps, "twin", direction, side)
-            ax.plot(f, sign * y, "o", ms=6.5, mfc="none", mec=TWIN_COLOUR, mew=0.8)
+            ax.plot(f, sign * y, **twin_dots)
         ax.set_ylabel("impacts per cycle")
         ax.set_title(direction)
-        ax.yaxis.set_major_locator(MaxNLocator(integer=True))
         format_mirrored_axis(ax)
     rows[-1].set_xlabel("frequency in Hz")
-    handles = [
-        Line2D([], [], color=TWIN_COLOUR, marker="o", ms=6.5, mfc="none", ls="", label="twin")
-    ]
+    keys = [Key("twin", twin_dots)]
     if run.source == "measured":
-        handles += [
-            Line2D(
-                [],
-                [],
-                color=DIRECTION_COLOURS[direction],
-                marker="o",
-                label=f"measured {direction}",
-            )
-            for direction in directions
-        ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=3)
+        keys += [Key(f"measured {name}", style) for name, style in measured_dots.items()]
+    figure.legend(keys, columns=3)
     caption = (
         "Mean over the measured cycles of a step; a fractional value means that the count varies "
         "from cycle to cycle."
@@ -239,9 +208,19 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
     }
     if not errors or run.windows:
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 2.5 * ((len(errors) + 1) // 2) + 0.4))
-    axes = figure.subplots((len(errors) + 1) // 2, 2, sharex=True, sharey=True, squeeze=False)
+    rows = (len(errors) + 1) // 2
+    figure = PanelFigure((FIGURE_WIDTH_IN, 2.5 * rows + 0.4), rows, 2, sharey="all")
+    styles = {
+        (kind, direction): {
+            "color": DIRECTION_COLOURS[direction], "ls": dash, "marker": "o", "lw": 0.9,
+            "mfc": DIRECTION_COLOURS[direction] if dash == "-" else "white",
+        }
+        for direction in DIRECTIONS
+        for kind, dash in (("free-running", "-"), ("restarted", ":"))
+    }  # fmt: skip
+    axes = figure.panels
     for ax, (part, step_nrmse) in zip(axes.flat, errors.items(), strict=False):
+        ax.set_yscale("log")
         for direction in DIRECTIONS:
             steps = [
                 step
@@ -250,32 +229,15 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
             ]
             f = [step.frequency_hz for step in steps]
             nrmse = np.array([step_nrmse[step.index] for step in steps]).reshape(-1, 2)
-            ax.semilogy(f, nrmse[:, 0], "o-", color=DIRECTION_COLOURS[direction], lw=0.9)
-            ax.semilogy(
-                f, nrmse[:, 1], "o:", color=DIRECTION_COLOURS[direction], lw=0.9, mfc="white"
-            )
+            for column, kind in enumerate(("free-running", "restarted")):
+                ax.plot(f, nrmse[:, column], **styles[kind, direction])
         ax.set_title(f"${part}$")
     for ax in axes[:, 0]:
         ax.set_ylabel("NRMSE")
     for ax in axes[-1]:
         ax.set_xlabel("frequency in Hz")
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=DIRECTION_COLOURS[direction],
-            marker="o",
-            ls=ls,
-            mfc=face,
-            label=f"{twin_kind}, {direction}",
-        )
-        for direction in DIRECTIONS
-        for twin_kind, ls, face in (
-            ("free-running", "-", DIRECTION_COLOURS[direction]),
-            ("restarted", ":", "white"),
-        )
-    ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4)
+    keys = [Key(f"{kind}, {direction}", style) for (kind, direction), style in styles.items()]
+    figure.legend(keys, columns=4)
     caption = (
         "NRMSE: RMS error divided by RMS measurement over the measured cycles of each step; a "
         "constant zero would give 1. The restarted twin starts every window from the measured "
@@ -289,8 +251,8 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
     blocks, rows = compute_envelopes(run)
     if not rows:
         return
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 1.7 * len(rows) + 0.4))
-    axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
+    figure = PanelFigure((FIGURE_WIDTH_IN, 1.7 * len(rows) + 0.4), len(rows))
+    axes = figure.panels[:, 0]
     peaks = {step.acceleration_m_s2 for step in run.recording.start.steps}
     for ax, (label, envelopes) in zip(axes, rows.items(), strict=True):
         for time, low, high in envelopes:
@@ -311,7 +273,9 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
     yield CaptionedFigure("overview", "Drive and response over the run", caption, figure)
 
 
-def _shade_steps(run: ReportData, ax: Axes, blocks: tuple[Block, ...], show_labels: bool) -> None:
+def _shade_steps(
+    run: ReportData, ax: FigurePanel, blocks: tuple[Block, ...], show_labels: bool
+) -> None:
     steps_by_index = {step.index: step for step in (*run.steps, *run.summary.visits)}
     duration_s = blocks[-1].time_s[-1] - blocks[0].time_s[0]
     next_label_s = 0.0
@@ -343,8 +307,9 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
     levels = [(step, step.level) for step in run.steps if step.level and step.level.accepted]
     if not levels:
         return
-    figure = Figure(figsize=(9.5, 4.6))
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    figure = PanelFigure((9.5, 4.6), 2, heights=(2, 1))
+    upper, lower = figure.panels[:, 0]
+    keys: list[Key] = []
     for direction in DIRECTIONS:
         own = sorted(
             (step.frequency_hz, level.error, level.error_uncorrected, level.correction)
@@ -355,15 +320,16 @@ def _draw_level(run: ReportData) -> CaptionedFigures:
             continue
         f, errors, uncorrected, corrections = np.array(own).T
         colour = DIRECTION_COLOURS[direction]
-        upper.plot(f, 100 * errors, "o-", ms=3, color=colour, label=direction)
-        upper.plot(
-            f, 100 * uncorrected, ":", lw=1.2, color=colour, label=f"{direction}, uncorrected"
-        )
-        lower.plot(f, corrections, "o-", color=colour, ms=3)
+        dotted = {"marker": "o", "ms": 3, "color": colour}
+        dashed = {"ls": ":", "lw": 1.2, "color": colour}
+        upper.plot(f, 100 * errors, **dotted)
+        upper.plot(f, 100 * uncorrected, **dashed)
+        lower.plot(f, corrections, **dotted)
+        keys += [Key(direction, dotted), Key(f"{direction}, uncorrected", dashed)]
     for tolerance_percent in (-2, 2):
         upper.axhline(tolerance_percent, color="#777777", lw=0.8, ls="--")
     upper.set_ylabel("level error in %")
-    upper.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0))
+    figure.legend(keys, columns=4)
     lower.set_ylabel("correction")
     lower.set_xlabel("frequency in Hz")
     yield CaptionedFigure(

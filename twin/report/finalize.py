@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from twin.recording.reader import read_recording
+from twin.report.report import write_report
 from twin.results.contracts import ReplayResult, RunSummary
 from twin.results.excitation_verdict import describe_peaks, format_excitation_verdict
 from twin.results.rerun import restore_predictions
@@ -25,8 +26,6 @@ def write_results(
     folder: Path, run_config: RunConfig, view: bool = False, replay: ReplayResult | None = None
 ) -> RunSummary:
     """Write summary, report and optional view of the run in a folder; return the summary."""
-    from twin.report.report import write_report
-
     recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
     summary = summarise(recording, run_config.parameters)
     if replay is not None:

@@ -9,7 +9,8 @@ from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
 from table_io.records import format_kind
-from twin.drawing.plot_style import FIGURE_WIDTH_IN, RC_PARAMS
+from twin.drawing.pictures import RC_PARAMS, render_figure
+from twin.drawing.plot_style import FIGURE_WIDTH_IN
 from twin.report.figures import draw_figures
 from twin.report.report import format_headline
 from twin.results.excitation_verdict import format_excitation_verdict
@@ -30,9 +31,10 @@ def write_pdf_report(run: ReportData, path: Path) -> None:
         for number, drawing in enumerate(draw_figures(run), 1):
             caption = textwrap.fill(drawing.caption, 130)
             heading = f"Figure {number}. {drawing.title}"
-            drawing.figure.text(0.0, 1.06, heading, weight="bold", va="bottom")
-            drawing.figure.text(0.0, -0.02, caption, va="top", size=8)
-            pdf.savefig(drawing.figure, bbox_inches="tight", pad_inches=0.4)
+            figure = render_figure(drawing.figure)
+            figure.text(0.0, 1.06, heading, weight="bold", va="bottom")
+            figure.text(0.0, -0.02, caption, va="top", size=8)
+            pdf.savefig(figure, bbox_inches="tight", pad_inches=0.4)
         for page in _make_text_pages("Steps, measured | twin", _tabulate_steps(run)):
             pdf.savefig(page)
 

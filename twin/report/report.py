@@ -23,11 +23,12 @@ from table_io.records import (
     format_kind,
 )
 from twin.compare.pipeline import EVENT_KINDS
-from twin.drawing.page import embed_images, format_significant, render_page
-from twin.drawing.plot_style import Picture
+from twin.drawing.charts import make_chart_script
+from twin.drawing.page import format_significant, render_page
+from twin.drawing.panels import CaptionedFigure
 from twin.drawing.table_motion_figures import MOTION_FIGURES
 from twin.recording.reader import Recording, read_recording
-from twin.report.figures import draw_run_figures
+from twin.report.figures import draw_figures
 from twin.results.contracts import LevelResult, MeasuredFold, OrbitResult, RunSummary
 from twin.results.excitation_verdict import describe_peaks, list_level_errors
 from twin.results.report_data import (
@@ -49,18 +50,14 @@ MAX_ROWS = 200
 MAX_TEXT_LENGTH = 20_000  # of a configuration as recorded
 
 
-def write_report(
-    folder: Path, recording: Recording | None = None, more_formats: Sequence[str] = ()
-) -> Path:
-    """Write folder/report.html and its figures from run.mcap and summary.json; return the path.
+def write_report(folder: Path, recording: Recording | None = None) -> Path:
+    """Write folder/report.html from run.mcap and summary.json; return the path.
 
-    A `recording` already in memory is not read again. `more_formats` of the figures: see
-    `save_figures`.
+    A `recording` already in memory is not read again.
     """
     run = load_report_data(folder, recording)
     path = folder / "report.html"
-    pictures = draw_run_figures(run, folder / "figures", more_formats)
-    path.write_text(render_report(run, pictures), encoding="utf-8")
+    path.write_text(render_report(run, list(draw_figures(run))), encoding="utf-8")
     return path
 
 
@@ -71,13 +68,11 @@ def load_report_data(folder: Path, recording: Recording | None = None) -> Report
     return build_report_data(recording or read_recording(folder / "run.mcap"), summary)
 
 
-def render_report(run: ReportData, pictures: list[Picture]) -> str:
-    """Render the report page as HTML text with every figure embedded."""
+def render_report(run: ReportData, figures: Sequence[CaptionedFigure]) -> str:
+    """Render the report page as HTML text with the data of every figure."""
     start, recording = run.recording.start, run.recording
     verdict = run.summary.twin_verdict if run.summary.is_twin_judged else None
     texts = {name: getattr(start, f"{name}_toml") for name in ("profile", "rig", "model")}
-    motion_pictures = [picture for picture in pictures if picture.path.stem in MOTION_FIGURES]
-    other_pictures = [picture for picture in pictures if picture not in motion_pictures]
     demand = {step.index: step.acceleration_m_s2 for step in start.steps}
     # Summaries of older versions do not state the demand.
     steps = [
@@ -98,8 +93,9 @@ def render_report(run: ReportData, pictures: list[Picture]) -> str:
         next_command=name_command(verdict, recording.path.parent) if verdict else "",
         format_jump=format_jump,
         configs={name: parse_toml_tables(text) for name, text in texts.items()},
-        images=embed_images(other_pictures),
-        motion_images=embed_images(motion_pictures),
+        charts=[figure for figure in figures if figure.name not in MOTION_FIGURES],
+        motion_charts=[figure for figure in figures if figure.name in MOTION_FIGURES],
+        script=make_chart_script(figures),
         format_required=format_required,
         demand=demand,
         peaks=describe_peaks(steps),

@@ -8,14 +8,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from twin.drawing.page import embed_images, render_page
-from twin.drawing.plot_style import (
-    DIRECTION_DASHES,
-    FIGURE_WIDTH_IN,
-    CaptionedFigure,
-    CaptionedFigures,
-    LineStyle,
-    save_figures,
-)
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures
+from twin.drawing.pictures import save_figures
+from twin.drawing.plot_style import DIRECTION_DASHES, FIGURE_WIDTH_IN, LineStyle
 from twin.drawing.prc_drawing import (
     FREE_PANELS,
     PRC_PANELS,

@@ -11,7 +11,7 @@ from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.drive import Drive, Segment
 from table_io.safety.preflight import CORRECTION_HEADROOM, list_limits
 from table_io.units import GRAVITY_M_S2
-from twin.drawing.plot_style import RC_PARAMS
+from twin.drawing.pictures import RC_PARAMS
 from twin.setup.run_config import RunConfig
 
 if TYPE_CHECKING:

@@ -20,21 +20,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import direction_handles, save_figures
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
     DIRECTION_DASHES,
     FREE_FLIGHT_COLOUR,
     HYSTERESIS_COLOURS,
     TWIN_COLOUR,
-    CaptionedFigure,
-    CaptionedFigures,
     LineStyle,
-    Picture,
-    direction_handles,
     guide_style,
-    save_figures,
 )
-from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, Panel, make_prc_panels, plot_prc
+from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, PrcPanel, make_prc_panels, plot_prc
 from twin.results.report_data import Curve
 from twin.studies.batch import format_gap_mm
 from twin.studies.result import CaseSummary, Row, SweepSummary
@@ -119,7 +116,7 @@ def _thin_out(gaps: list[float]) -> list[float]:
     return [gaps[round(position)] for position in np.linspace(0, len(gaps) - 1, MAX_FIGURES)]
 
 
-def _make_panels(curves: Iterable[Curves]) -> tuple[Figure, list[Panel]]:
+def _make_panels(curves: Iterable[Curves]) -> tuple[Figure, list[PrcPanel]]:
     contents = PRC_PANELS if any(map(_has_contact, curves)) else FREE_PANELS
     figure = Figure(figsize=(11, 3.4 * len(contents) / 2 + 1))
     axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
@@ -130,7 +127,7 @@ def _has_contact(curves: Curves) -> bool:
     return any(row["eta_r"] or row["eta_l"] for rows in curves.values() for row in rows)
 
 
-def _draw_case(panels: list[Panel], curves: Curves, colour: str, width: float) -> None:
+def _draw_case(panels: list[PrcPanel], curves: Curves, colour: str, width: float) -> None:
     def extract_column(direction: str, name: str) -> Curve:
         rows = curves.get(direction, ())
         f, y = (np.array([row[column] for row in rows], dtype=np.float64)

@@ -18,7 +18,8 @@ from twin.discovery.features.task import FeatureModel
 from twin.discovery.result import FeatureVerdict, label_feature, name_fit
 from twin.discovery.words import format_interval, name_effect
 from twin.drawing.page import embed_images, write_page
-from twin.drawing.plot_style import CaptionedFigure, Picture, save_figures
+from twin.drawing.panels import CaptionedFigure, Picture
+from twin.drawing.pictures import save_figures
 from twin.laws.library import find_effect
 from twin.laws.typesetting import typeset_law
 

@@ -15,7 +15,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter
 
 from table_io.block import Float1D
 from twin.compare.curves import FloatND
-from twin.drawing.plot_style import CaptionedFigure, CaptionedFigures, Picture, save_figures
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
+from twin.drawing.pictures import save_figures
 from twin.studies.maps.config import VariedParameter
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.results import (

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from twin.drawing.plot_style import CaptionedFigure, save_figures
+from twin.drawing.panels import CaptionedFigure
+from twin.drawing.pictures import save_figures
 
 
 def draw_line() -> Iterator[CaptionedFigure]:

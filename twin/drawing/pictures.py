@@ -1,0 +1,193 @@
+"""Pictures of figures: PNG, SVG and PDF by matplotlib, CSV of the lines.
+
+Import only to draw: matplotlib is slow to import.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from twin.drawing.panels import (
+    AXES_COORDINATES,
+    CaptionedFigure,
+    FigurePanel,
+    Key,
+    PanelFigure,
+    Picture,
+    write_line_data,
+)
+from twin.drawing.plot_style import DirectionStyle, direction_keys
+from twin.recording.recovery import pause_collection
+from twin.results.report_data import DIRECTIONS
+from twin.system.terminal import show_status
+
+RC_PARAMS: dict[Any, Any] = {
+    "font.size": 9, "axes.titlesize": 9.5, "axes.titlelocation": "left", "axes.linewidth": 0.7,
+    "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True,
+    "grid.color": "#e4e4e4", "grid.linewidth": 0.6, "axes.axisbelow": True, "savefig.dpi": 150,
+    "svg.hashsalt": "shaketwin",  # equal ids of clips, so that equal figures are equal bytes
+    "legend.frameon": False, "lines.linewidth": 1.1, "lines.markersize": 3.6,
+    "figure.constrained_layout.use": True, "figure.constrained_layout.hspace": 0.06,
+}  # fmt: skip
+DARK_RC_PARAMS: dict[Any, Any] = {
+    "figure.facecolor": "#16181d", "savefig.facecolor": "#16181d", "axes.facecolor": "#16181d",
+    "text.color": "#e6e6e6", "axes.labelcolor": "#e6e6e6", "axes.edgecolor": "#9a9a9a",
+    "xtick.color": "#c8c8c8", "ytick.color": "#c8c8c8", "grid.color": "#33363d",
+}  # fmt: skip
+PNG_OPTIONS = {"compress_level": 3}  # 6 takes twice the time for a twentieth of the size
+MAX_DIGITS_RATIO = 1e3  # of a logarithmic axis: up to it 1, 2 and 5 are labelled, not 1 alone
+NO_DATE = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # equal figures, equal bytes
+
+
+class QuickLayout(ConstrainedLayoutEngine):
+    """Constrained layout that measures the labels of each axes in its second pass only.
+
+    Both passes measure all labels, which takes longer than drawing them. The first only brings the
+    axes about to their place, for which a guess of the margins is enough.
+    """
+
+    GUESSED_MARGIN_IN = 0.2
+
+    def execute(self, fig: Figure) -> Any:
+        """Lay out the axes of a figure."""
+        for axes in fig.axes:
+            measure = self._guess_first(axes, self.GUESSED_MARGIN_IN * fig.dpi)
+            axes.get_tightbbox = measure  # type: ignore[method-assign]
+        try:
+            return super().execute(fig)
+        finally:
+            for axes in fig.axes:
+                del axes.get_tightbbox  # that of the class again
+
+    @staticmethod
+    def _guess_first(axes: Axes, margin: float) -> Callable[..., Any]:
+        """Return a `get_tightbbox` for the axes whose first call guesses; `margin` in pixels."""
+        calls = iter([True])
+
+        def get_tightbbox(*arguments: Any, **options: Any) -> Any:
+            if not next(calls, False) or not axes.get_visible():
+                return type(axes).get_tightbbox(axes, *arguments, **options)
+            return axes.get_window_extent().padded(margin)
+
+        return get_tightbbox
+
+
+def save_figures(
+    figures: Iterable[CaptionedFigure],
+    folder: Path,
+    dark: bool = False,
+    more_formats: Sequence[str] = (),
+) -> list[Picture]:
+    """Save figures as PNG files in `folder`; return them in order.
+
+    `more_formats`: also as svg, pdf, or csv, the data of the lines of panels.
+
+    The figures are drawn while they are iterated over: `figures` must be a generator, so that
+    the style applies. `dark`: on a dark ground; only for figures whose colors allow it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    pictures = []
+    style = RC_PARAMS | (DARK_RC_PARAMS if dark else {})
+    with (
+        mpl.rc_context(style),
+        pause_collection(),
+        show_status("drawing the figures") as show_part,
+    ):
+        for drawing in figures:
+            show_part(drawing.title)
+            path = folder / f"{drawing.name}.png"
+            figure = render_figure(drawing.figure)
+            _fix_layout(figure)
+            figure.savefig(path, pil_kwargs=PNG_OPTIONS)
+            if "csv" in more_formats and isinstance(drawing.figure, PanelFigure):
+                write_line_data(drawing.figure, path.with_suffix(".csv"))
+            for suffix in more_formats:
+                if suffix != "csv":
+                    figure.savefig(path.with_suffix(f".{suffix}"), metadata=NO_DATE.get(suffix))
+            pictures.append(Picture(path, drawing.title, drawing.caption))
+    return pictures
+
+
+def render_figure(figure: PanelFigure | Figure) -> Figure:
+    """Return the matplotlib figure of panels."""
+    if isinstance(figure, Figure):
+        return figure
+    rendered = Figure(figsize=figure.size_in)
+    rows, columns = figure.panels.shape
+    axes = rendered.subplots(
+        rows, columns, sharex=figure.sharex, sharey=figure.sharey, squeeze=False,
+        height_ratios=figure.heights, width_ratios=figure.widths,
+    )  # fmt: skip
+    for place, ax in np.ndenumerate(axes):
+        panel = figure.panels[place]
+        if panel is None:
+            ax.remove()
+        else:
+            _repeat_calls(panel, ax)
+    if figure.keys:
+        handles = make_handles(figure.keys)
+        rendered.legend(handles=handles, loc="outside upper center", ncols=figure.key_columns)
+    return rendered
+
+
+def _repeat_calls(panel: FigurePanel, ax: Axes) -> None:
+    for call in panel.calls:
+        if call.name == "set_absolute_labels":
+            ax.yaxis.set_major_formatter(lambda value, _: f"{abs(value):g}")
+            continue
+        style = dict(call.style)
+        if style.get("transform") == AXES_COORDINATES:
+            style["transform"] = ax.transAxes
+        getattr(ax, call.name)(*call.arguments, **style)
+    for axis in (ax.xaxis, ax.yaxis):
+        if axis.get_scale() == "log":
+            low, high = axis.get_view_interval()
+            digits = (1.0, 2.0, 5.0) if high < MAX_DIGITS_RATIO * low else (1.0,)
+            axis.set_major_locator(LogLocator(subs=digits))
+            axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axis.set_minor_formatter(NullFormatter())
+
+
+def make_handles(keys: Iterable[Key]) -> list[Line2D | Patch]:
+    """Return the legend of matplotlib for keys."""
+    return [
+        Patch(**key.style, label=key.label)
+        if key.is_patch
+        else Line2D([], [], **key.style, label=key.label)
+        for key in keys
+    ]
+
+
+def direction_handles(
+    make_style: DirectionStyle, prefix: str = "", directions: Sequence[str] = DIRECTIONS
+) -> list[Line2D]:
+    """Return a legend handle per direction, labelled "<prefix><direction>"."""
+    keys = direction_keys(make_style, prefix, directions)
+    return [Line2D([], [], **key.style, label=key.label) for key in keys]
+
+
+def _fix_layout(figure: Figure) -> None:
+    """Lay out a figure once: `savefig` with a layout engine would draw it twice."""
+    engine = figure.get_layout_engine()
+    if isinstance(engine, ConstrainedLayoutEngine):
+        figure.set_dpi(mpl.rcParams["savefig.dpi"])
+        QuickLayout(**engine.get()).execute(figure)
+        figure.set_layout_engine("none")
+
+
+def label_panel(ax: Axes, panel_letter: str, text: str = "") -> None:
+    """Write the panel letter and a centered title above a panel."""
+    ax.set_title(text, loc="center")
+    ax.text(
+        0, 1.02, panel_letter, transform=ax.transAxes, weight="bold", ha="left", va="bottom",
+        size=10,
+    )  # fmt: skip
