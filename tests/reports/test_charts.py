@@ -71,9 +71,9 @@ def test_limits_are_those_of_the_data_or_set_and_shared() -> None:
     right.plot([1.0, 5.0], [-10.0, 5.0], color="#1559b0", marker="o", ls="")
     right.set_xlim(0.5, None)
     charts = read_charts(figure)
-    one, other = charts["figures"][0]["rows"][0]
-    assert one["x"] == other["x"] == pytest.approx([0.5, 5.2])
-    assert one["y"] == other["y"] == pytest.approx([-10.75, 10.5])
+    first, second = charts["figures"][0]["rows"][0]
+    assert first["x"] == second["x"] == pytest.approx([0.5, 5.2])
+    assert first["y"] == second["y"] == pytest.approx([-10.75, 10.5])
     assert charts["columns"][0] == [1.0, 3.0]
 
 
