@@ -15,6 +15,7 @@ folder `runs/<date>-<time>-<name>` is made.
 
 from table_io.errors import InputError
 from twin.archive.catalog import Catalog, update_catalog
+from twin.archive.fleet import Fleet, FleetOptions, run_fleet
 from twin.archive.notes import RunNotes, note_run
 from twin.archive.query import index_runs
 from twin.archive.run_row import RunRow
@@ -64,6 +65,8 @@ __all__ = [
     "FeatureModel",
     "FeatureVerdict",
     "FittedModel",
+    "Fleet",
+    "FleetOptions",
     "FollowedBranches",
     "GapOptions",
     "IdentificationReport",
@@ -112,6 +115,7 @@ __all__ = [
     "read_curves",
     "repair_log",
     "replay",
+    "run_fleet",
     "run_simulated",
     "simulate",
     "simulate_gaps",

@@ -144,6 +144,17 @@ StepsOption = Annotated[
 SaveViewOption = Annotated[
     bool, typer.Option("--view", callback=require_view_extra, help="Also write view.rrd.")
 ]
+WorkersOption = Annotated[
+    int | None, typer.Option("--workers", help="Processes; default: one per core.")
+]
+SchedulerOption = Annotated[
+    str,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Compute on the workers of this Dask scheduler, which share the folder.",
+    ),
+]
 ListenOption = Annotated[
     str, typer.Option("--listen", help="Endpoint at which observers reach the test.")
 ]

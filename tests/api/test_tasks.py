@@ -38,6 +38,7 @@ TASKS = {
     "report": ("write_folder_report",),
     "runs": ("index_runs",),
     "catalog": ("update_catalog",),
+    "fleet": ("run_fleet",),
     "note": ("note_run",),
     "simulate": ("simulate",),
     "table-drive": ("compute_drive",),

@@ -1,11 +1,30 @@
-"""Commands `catalog`, `runs` and `note`: the archive of a laboratory."""
+"""Commands `catalog`, `runs`, `note` and `fleet`: the archive of a laboratory."""
 
+import enum
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from twin.options import JsonOption, LogArgument
+from twin.options import (
+    JsonOption,
+    LogArgument,
+    ModelOption,
+    OutOption,
+    SchedulerOption,
+    WorkersOption,
+)
+
+
+class FleetTask(enum.StrEnum):
+    """Command that a fleet runs on every log."""
+
+    verify = "verify"
+    prc = "prc"
+    replay = "replay"
+    identify = "identify"
+    discover = "discover"
+
 
 WhereOption = Annotated[
     str | None,
@@ -65,3 +84,35 @@ def note_command(
     from twin.archive.command import print_note
 
     print_note(run, text, tag or [], untag or [])
+
+
+def fleet_command(
+    task: Annotated[
+        FleetTask,
+        typer.Argument(metavar="COMMAND", help="verify, prc, replay, identify, discover."),
+    ],
+    places: Annotated[
+        list[Path], typer.Argument(metavar="FOLDER|LOG...", help="Logs, runs and folders of runs.")
+    ],
+    where: WhereOption = None,
+    model: ModelOption = None,
+    out: OutOption = None,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with the fleet in --out, failures again."),
+    ] = False,
+    since: Annotated[
+        Path | None,
+        typer.Option("--since", metavar="FLEET", help="List what changed since this fleet."),
+    ] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = "",
+) -> None:
+    """Run a command on many recordings, on all cores or a cluster, into one table; resumable."""
+    from twin.archive.fleet import FleetOptions
+    from twin.archive.fleet_command import print_fleet
+
+    options = FleetOptions(
+        task.value, tuple(places), where, model, out, workers, scheduler, resume, since
+    )
+    raise typer.Exit(print_fleet(options))

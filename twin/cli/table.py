@@ -95,6 +95,7 @@ COMMANDS = (
     Command("runs", LOOK, "twin.archive.cli:runs_command"),
     Command("catalog", LOOK, "twin.archive.cli:catalog_command"),
     Command("note", LOOK, "twin.archive.cli:note_command"),
+    Command("fleet", LOOK, "twin.archive.cli:fleet_command", computes=True),
     Command("compare", LOOK, "twin.inspection.cli:compare_command", computes=True),
     Command("guide", PLAN, "twin.guide.command:open_guide"),
     Command("check", PLAN, "twin.rig.cli:check_command", computes=True),
@@ -140,6 +141,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "view": ("view last", "view runs/first --save view.rrd"),
     "runs": ("runs", "runs archive --where 'gap_mm = 4 and twin_misfit > 3'"),
     "catalog": ("catalog archive", "catalog campaign_a campaign_b --out both"),
+    "fleet": (
+        "fleet identify archive --where 'gap_mm = 4' --out stiffness",
+        "fleet replay archive --model new.toml --out new --since old"),
     "note": ("note last 'bumper B2 replaced' --tag repaired", "note runs/first --untag repaired"),
     "compare": ("compare runs/first runs/second", "compare runs/first last"),
     "guide": ("guide", "guide --out guide_pages"),

@@ -19,7 +19,9 @@ from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import parse_step_range
 from twin.replay.pipeline_replay import (
+    RecordedRun,
     ReplayComparison,
+    SampleRange,
     describe_deviation,
     replay_recording,
 )
@@ -220,21 +222,10 @@ def replay_all(request: ReplayRequest) -> int:
         recorded = open_replay_log(log)
         span = select_span(recorded.recording, request.steps)
         for model in models:
-            config = load_replay_config(recorded.recording, model)
             replay_folder = folder / _folder_name(name, model)
-            replay_folder.mkdir()
-            new_log = replay_folder / "run.mcap"
-            identity = replay_recording(
-                recorded, config, new_log, replay_folder.name, lambda _: None, span
-            )
-            entry = describe_replay(recorded, config, model, identity, new_log)
-            summary = summaries.summarise(
-                read_recording(new_log, TOPIC_TYPES.keys() - {PRED_TOPIC}), config.parameters
-            )
-            summary.replay = entry
-            summary.write(replay_folder / "summary.json")
-            print_line(f"{replay_folder.name}: {format_identity(identity, entry)}")
-            rows.append(_make_row(name, model, summary, entry))
+            row, result = tabulate_replay(recorded, name, model, replay_folder, span)
+            print_line(f"{replay_folder.name}: {result}")
+            rows.append(row)
     _write_comparison(folder, rows)
     print_table(console, _make_table(rows))
     print_line(f"{folder / 'comparison.csv'}, {folder / 'comparison.json'}; a page of one: "
@@ -242,6 +233,26 @@ def replay_all(request: ReplayRequest) -> int:
     if any(row.same_model and row.identical is False for row in rows):
         return EXIT_NOT_IDENTICAL
     return EXIT_GAPS if any(row.gaps for row in rows) else 0
+
+
+def tabulate_replay(
+    recorded: RecordedRun, name: str, model: str, folder: Path, span: SampleRange
+) -> tuple[ReplayRow, str]:
+    """Replay samples of a log into a new folder, without a report.
+
+    Return the row of the comparison, with `name` as its log, and whether it is identical in words.
+    """
+    config = load_replay_config(recorded.recording, model)
+    folder.mkdir()
+    new_log = folder / "run.mcap"
+    identity = replay_recording(recorded, config, new_log, folder.name, lambda _: None, span)
+    entry = describe_replay(recorded, config, model, identity, new_log)
+    summary = summaries.summarise(
+        read_recording(new_log, TOPIC_TYPES.keys() - {PRED_TOPIC}), config.parameters
+    )
+    summary.replay = entry
+    summary.write(folder / "summary.json")
+    return _make_row(name, model, summary, entry), format_identity(identity, entry)
 
 
 def _check_replays(request: ReplayRequest, models: list[str], names: list[str]) -> None:

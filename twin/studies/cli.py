@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from twin.options import OutOption, complete_names, describe_names
+from twin.options import (
+    OutOption,
+    SchedulerOption,
+    WorkersOption,
+    complete_names,
+    describe_names,
+)
 
 
 def map_command(
@@ -19,17 +25,8 @@ def map_command(
     ],
     out: OutOption = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue the study in --out.")] = False,
-    workers: Annotated[
-        int | None, typer.Option("--workers", help="Processes; default: one per core.")
-    ] = None,
-    scheduler: Annotated[
-        str,
-        typer.Option(
-            "--scheduler",
-            metavar="ADDRESS",
-            help="Compute on the workers of this Dask scheduler, which share the folder.",
-        ),
-    ] = "",
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = "",
     show: Annotated[
         bool, typer.Option("--show", help="Compute nothing; write the page of what is stored.")
     ] = False,

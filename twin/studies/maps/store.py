@@ -9,9 +9,8 @@ line is computed again and its bytes are the same.
 import hashlib
 import json
 import math
-import os
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,13 @@ from table_io.block import Float2D
 from table_io.config.plugins import list_entry_points
 from table_io.errors import InputError
 from twin.laws.library import ENTRY_POINT_GROUP as EFFECT_GROUP
-from twin.results.contract import Contract
+from twin.results.sealed_lines import (
+    SealedLine,
+    SealedLines,
+    hash_contract,
+    is_sealed,
+    make_damage_error,
+)
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.outcomes import ENTRY_POINT_GROUP as OUTCOME_GROUP
 from twin.studies.maps.outcomes import SweepPlan
@@ -38,7 +43,7 @@ COORDINATE_CHUNK = 100_000  # cases
 DIRECTION_VALUES = {"forward": 1, "backward": -1}
 
 
-class StoredChunk(Contract):
+class StoredChunk(SealedLine):
     """Line of `chunks.jsonl`: cases from `first` on, and why cases have no result by number."""
 
     chunk: int
@@ -46,7 +51,6 @@ class StoredChunk(Contract):
     cases: int
     sha256: str
     failures: dict[int, str]
-    line_sha256: str = ""  # of the line itself, none in a study of an earlier version
 
     @property
     def span(self) -> slice:
@@ -91,7 +95,7 @@ def create_store(folder: Path, study: Study, sweep: SweepPlan, values: Float2D) 
     # Last: a folder with a definition has the whole group.
     definition = make_definition(study)
     definition.store_sha256 = _hash_store(folder, open_group(folder, "r"), study)
-    definition.sha256 = _hash_contract(definition, "sha256")
+    definition.sha256 = hash_contract(definition, "sha256")
     text = json.dumps(definition.to_plain(), indent=1, sort_keys=True)
     replace_text(folder / DEFINITION_FILE, text)
 
@@ -105,12 +109,6 @@ def _hash_store(folder: Path, group: Any, study: Study) -> str:
         for path in sorted(store.rglob("zarr.json"))
     }
     return hash_arrays(arrays | {name: group[name][:] for name in names})
-
-
-def _hash_contract(contract: Contract, key: str) -> str:
-    """Return a hash of all that a contract holds but `key`, where the hash stands."""
-    plain = {name: value for name, value in contract.to_plain().items() if name != key}
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def require_unchanged_store(folder: Path, study: Study, definition: StudyDefinition) -> None:
@@ -190,30 +188,10 @@ def read_definition(folder: Path) -> StudyDefinition:
             "no study", where=folder, allowed="a folder in which `shaketwin map` has started one"
         ) from None
     except ValidationError as error:
-        raise _make_damage_error(path, error) from None
-    if not _is_sealed(definition, "sha256", bool(definition.store_sha256)):
-        raise _make_damage_error(path, "it is not what was written")
+        raise make_damage_error(path, error) from None
+    if not is_sealed(definition, "sha256", bool(definition.store_sha256)):
+        raise make_damage_error(path, "it is not what was written")
     return definition
-
-
-def _is_sealed(contract: Contract, key: str, must_be: bool) -> bool:
-    """Return whether the hash at `key` is that of the rest; an empty one where none `must_be`."""
-    stated: str = getattr(contract, key)
-    return stated == _hash_contract(contract, key) if stated else not must_be
-
-
-def _make_damage_error(path: Path, error: ValidationError | str, place: str = "") -> InputError:
-    problem = error if isinstance(error, str) else _describe_first(error)
-    return InputError(
-        f"damaged: {place}: {problem}" if place else f"damaged: {problem}",
-        where=path,
-        remedy="restore it, or start a new study elsewhere",
-    )
-
-
-def _describe_first(error: ValidationError) -> str:
-    first = error.errors()[0]
-    return ": ".join(filter(None, (".".join(map(str, first["loc"])), first["msg"])))
 
 
 def read_study_versions() -> dict[str, str]:
@@ -301,24 +279,9 @@ class Manifest:
     def __init__(self, folder: Path, names: Iterable[str]) -> None:
         """`names`: the variables of the study, in the order of the hash."""
         self._path, self._names = folder / MANIFEST_FILE, tuple(names)
-        self._is_sealed = bool(read_definition(folder).store_sha256)
-        self.chunks = {chunk.chunk: chunk for chunk in self._read_lines()}
-
-    def _read_lines(self) -> Iterator[StoredChunk]:
-        if not self._path.exists():
-            return
-        text = self._path.read_text(encoding="utf-8", errors="replace")
-        for number, line in enumerate(text.splitlines(keepends=True), 1):
-            if not line.endswith("\n"):  # the process died while it wrote it
-                continue
-            try:
-                chunk = StoredChunk.model_validate_json(line, extra="ignore")
-            except ValidationError as error:
-                raise _make_damage_error(self._path, error, f"line {number}") from None
-            if not _is_sealed(chunk, "line_sha256", self._is_sealed):
-                problem = "it is not what was written"
-                raise _make_damage_error(self._path, problem, f"line {number}")
-            yield chunk
+        must_be_sealed = bool(read_definition(folder).store_sha256)
+        self._lines = SealedLines(self._path, StoredChunk, must_be_sealed)
+        self.chunks = {chunk.chunk: chunk for chunk in self._lines.read()}
 
     def start(self, group: Any) -> None:
         """Drop a line that was cut, and those whose chunks are not what was stored.
@@ -328,7 +291,7 @@ class Manifest:
         self.chunks = {
             number: chunk for number, chunk in self.chunks.items() if self.holds(group, chunk)
         }
-        self._rewrite(self.chunks.values())
+        self._lines.rewrite(self.chunks.values())
 
     def holds(self, group: Any, chunk: StoredChunk) -> bool:
         """Return whether a chunk on the disk can be read and is what was computed."""
@@ -352,20 +315,11 @@ class Manifest:
 
     def add(self, chunk: StoredChunk) -> None:
         """Add the line of a stored chunk; the line is on the disk when this returns."""
-        chunk = chunk.model_copy()
-        chunk.line_sha256 = _hash_contract(chunk, "line_sha256")
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(_format_line(chunk))
-            file.flush()
-            os.fsync(file.fileno())
-        self.chunks[chunk.chunk] = chunk
+        self.chunks[chunk.chunk] = self._lines.add(chunk)
 
     def finish(self) -> None:
         """Sort the lines by chunk: the file of a finished study does not depend on the workers."""
-        self._rewrite(self.chunks[number] for number in sorted(self.chunks))
-
-    def _rewrite(self, chunks: Iterable[StoredChunk]) -> None:
-        replace_text(self._path, "".join(map(_format_line, chunks)))
+        self._lines.rewrite(self.chunks[number] for number in sorted(self.chunks))
 
     @property
     def case_count(self) -> int:
@@ -377,7 +331,3 @@ class Manifest:
         """Reasons of the cases without a result, by their numbers."""
         chunks = self.chunks.values()
         return {case: reason for chunk in chunks for case, reason in chunk.failures.items()}
-
-
-def _format_line(chunk: StoredChunk) -> str:
-    return json.dumps(chunk.to_plain()) + "\n"
