@@ -5,16 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from matplotlib.image import imread
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from table_io.block import Block
 from table_io.records import Params
 from tests.builders.recordings import store_items
 from tests.reports.folders import Drawn, Maker
 from tests.reports.recordings import STEPS, blocks, one_step, signals, summary
-from twin.drawing.pictures import QuickLayout, save_figures
+from twin.drawing.pictures import save_figures
 from twin.drawing.plot_style import PRECOMPRESSION_COLOUR
 from twin.model.parameters import Parameters
 from twin.recording.reader import read_recording
@@ -124,20 +122,3 @@ def test_a_drawn_velocity_is_exact_for_a_cubic_and_missing_at_its_ends(rate: flo
     ends = 2 * max(2, round(0.01 * rate))
     assert inside.sum() == t.size - ends
     assert slope[inside] == pytest.approx((-2.0 + 60.0 * t - 1200.0 * t**2)[inside], rel=1e-6)
-
-
-def test_the_quick_layout_is_that_of_two_measured_passes() -> None:
-    """Its guess of the first pass leaves no trace: labels of any size have their room."""
-    placed = []
-    for engine in (QuickLayout, ConstrainedLayoutEngine):
-        figure = Figure(figsize=(8, 5), dpi=150, layout="constrained")
-        axes = figure.subplots(2, 2, sharex=True)
-        for number, ax in enumerate(axes.flat):
-            ax.plot([0, 1], [0, 10.0 ** (3 * number)])
-            ax.set_ylabel("force in N\nof the damper" if number == 2 else "u")
-            ax.set_title(f"panel {number}")
-        figure.suptitle("title")
-        engine().execute(figure)
-        placed.append([ax.get_position().bounds for ax in axes.flat])
-    quick, measured = placed
-    np.testing.assert_allclose(quick, measured, atol=0.004)

@@ -3,7 +3,7 @@
 Import only to draw: matplotlib is slow to import.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -43,42 +42,10 @@ DARK_RC_PARAMS: dict[Any, Any] = {
     "text.color": "#e6e6e6", "axes.labelcolor": "#e6e6e6", "axes.edgecolor": "#9a9a9a",
     "xtick.color": "#c8c8c8", "ytick.color": "#c8c8c8", "grid.color": "#33363d",
 }  # fmt: skip
+MARGINS_IN = {"left": 0.75, "panel": 0.12, "title": 0.2, "ticks": 0.25, "bottom": 0.5, "key": 0.2}
 PNG_OPTIONS = {"compress_level": 3}  # 6 takes twice the time for a twentieth of the size
 MAX_DIGITS_RATIO = 1e3  # of a logarithmic axis: up to it 1, 2 and 5 are labelled, not 1 alone
 NO_DATE = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}  # equal figures, equal bytes
-
-
-class QuickLayout(ConstrainedLayoutEngine):
-    """Constrained layout that measures the labels of each axes in its second pass only.
-
-    Both passes measure all labels, which takes longer than drawing them. The first only brings the
-    axes about to their place, for which a guess of the margins is enough.
-    """
-
-    GUESSED_MARGIN_IN = 0.2
-
-    def execute(self, fig: Figure) -> Any:
-        """Lay out the axes of a figure."""
-        for axes in fig.axes:
-            measure = self._guess_first(axes, self.GUESSED_MARGIN_IN * fig.dpi)
-            axes.get_tightbbox = measure  # type: ignore[method-assign]
-        try:
-            return super().execute(fig)
-        finally:
-            for axes in fig.axes:
-                del axes.get_tightbbox  # that of the class again
-
-    @staticmethod
-    def _guess_first(axes: Axes, margin: float) -> Callable[..., Any]:
-        """Return a `get_tightbbox` for the axes whose first call guesses; `margin` in pixels."""
-        calls = iter([True])
-
-        def get_tightbbox(*arguments: Any, **options: Any) -> Any:
-            if not next(calls, False) or not axes.get_visible():
-                return type(axes).get_tightbbox(axes, *arguments, **options)
-            return axes.get_window_extent().padded(margin)
-
-        return get_tightbbox
 
 
 def save_figures(
@@ -121,11 +88,12 @@ def render_figure(figure: PanelFigure | Figure) -> Figure:
     """Return the matplotlib figure of panels."""
     if isinstance(figure, Figure):
         return figure
-    rendered = Figure(figsize=figure.size_in)
+    rendered = Figure(figsize=figure.size_in, layout="none")
     rows, columns = figure.panels.shape
     axes = rendered.subplots(
         rows, columns, sharex=figure.sharex, sharey=figure.sharey, squeeze=False,
         height_ratios=figure.heights, width_ratios=figure.widths,
+        gridspec_kw=_place_panels(figure),
     )  # fmt: skip
     for place, ax in np.ndenumerate(axes):
         panel = figure.panels[place]
@@ -135,8 +103,25 @@ def render_figure(figure: PanelFigure | Figure) -> Figure:
             _repeat_calls(panel, ax)
     if figure.keys:
         handles = make_handles(figure.keys)
-        rendered.legend(handles=handles, loc="outside upper center", ncols=figure.key_columns)
+        rendered.legend(handles=handles, loc="upper center", ncols=figure.key_columns)
     return rendered
+
+
+def _place_panels(figure: PanelFigure) -> dict[str, float]:
+    """Return margins and distances with room for labels: measuring all doubles the time."""
+    (width, height), (rows, columns) = figure.size_in, figure.panels.shape
+    has_titles = any(any(panel.find("set_title")) for _, _, panel in figure.list_panels())
+    above = MARGINS_IN["title"] * has_titles
+    between = MARGINS_IN["panel"] + above + MARGINS_IN["ticks"] * (not figure.sharex)
+    key_rows = -(-len(figure.keys) // figure.key_columns)
+    top = MARGINS_IN["panel"] + above + MARGINS_IN["key"] * key_rows
+    inner = height - top - MARGINS_IN["bottom"] - (rows - 1) * between
+    across = width - columns * MARGINS_IN["left"] - MARGINS_IN["panel"]
+    return {
+        "left": MARGINS_IN["left"] / width, "right": 1 - MARGINS_IN["panel"] / width,
+        "top": 1 - top / height, "bottom": MARGINS_IN["bottom"] / height,
+        "hspace": between / (inner / rows), "wspace": MARGINS_IN["left"] / (across / columns),
+    }  # fmt: skip
 
 
 def _repeat_calls(panel: FigurePanel, ax: Axes) -> None:
@@ -178,9 +163,9 @@ def direction_handles(
 def _fix_layout(figure: Figure) -> None:
     """Lay out a figure once: `savefig` with a layout engine would draw it twice."""
     engine = figure.get_layout_engine()
-    if isinstance(engine, ConstrainedLayoutEngine):
+    if engine is not None:
         figure.set_dpi(mpl.rcParams["savefig.dpi"])
-        QuickLayout(**engine.get()).execute(figure)
+        engine.execute(figure)
         figure.set_layout_engine("none")
 
 
