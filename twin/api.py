@@ -27,6 +27,11 @@ from twin.discovery.features.task import FeatureModel, discover_features
 from twin.discovery.result import FeatureVerdict, IdentificationReport, Interval, Verdict
 from twin.discovery.task import DiscoveredModel, FittedModel, discover, identify
 from twin.earthquakes.result import DriveResult, TableTwinResult
+from twin.earthquakes.spectrum_record import (
+    RecordShape,
+    SpectrumRecordOptions,
+    compute_spectrum_records,
+)
 from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
 from twin.exchange.drive_file import DriveOptions, ExportedDrive, export_drive
 from twin.exchange.export import Exported, ExportOptions, export_log
@@ -76,12 +81,14 @@ __all__ = [
     "Interval",
     "Log",
     "MapOptions",
+    "RecordShape",
     "RecordedCurves",
     "ReplayedLog",
     "RunNotes",
     "RunRow",
     "SimulatedGaps",
     "SimulatedSweeps",
+    "SpectrumRecordOptions",
     "StoredMap",
     "SweepOptions",
     "TableDriveOptions",
@@ -98,6 +105,7 @@ __all__ = [
     "compare_runs",
     "compute_drive",
     "compute_map",
+    "compute_spectrum_records",
     "decide",
     "discover",
     "discover_features",

@@ -106,12 +106,11 @@ def find_resonances(
 
 
 def find_pass_resonances(
-    config: SweptSine, levels: Sequence[SweepLevel], sweep: int
+    config: SweptSine, levels: Sequence[SweepLevel]
 ) -> list[tuple[float, float]]:
     """Return (frequency in Hz, ratio) of the resonances that a pass shows, largest first."""
-    own = [level for level in levels if config.find_pass(level.step) == sweep]
-    if len(own) < 3 or config.response_channel not in own[0].channels:
+    if len(levels) < 3 or config.response_channel not in levels[0].channels:
         return []
-    ratios = np.exp([ratio for _, ratio in list_ratio_points(own, config.response_channel)])
-    frequencies_hz = np.array([level.frequency_hz for level in own])
+    ratios = np.exp([ratio for _, ratio in list_ratio_points(levels, config.response_channel)])
+    frequencies_hz = np.array([level.frequency_hz for level in levels])
     return find_resonances(frequencies_hz, ratios, config.min_amplification)

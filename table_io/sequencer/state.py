@@ -1,5 +1,6 @@
 """State of the sequencer: test plan, drive so far, tuning and the next decision."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from table_io.adaptive.continuation import MeasuredOrbit, OrbitTarget
@@ -89,15 +90,16 @@ class OrbitSearch:
 
 @dataclass(frozen=True, eq=False)
 class SweepSearch:
-    """Swept sine so far: place at the end of the trajectory, and the levels measured.
+    """Swept sine so far: place at the end of the trajectory, and what was measured.
 
-    Windows begin at sample `since` or later, behind a soft start. `dwells` are the resonances in Hz
-    still ahead, None while the passes last; the present dwell ends at sample `until`.
+    Windows begin at sample `since` or later, behind a soft start. `passes` are the levels measured
+    by pass or dwell. `dwells` are the resonances in Hz still ahead, None while the passes last; the
+    present dwell ends at sample `until`.
     """
 
     position: SweptPosition
     since: int
-    levels: tuple[SweepLevel, ...] = ()
+    passes: Mapping[int, tuple[SweepLevel, ...]] = field(default_factory=dict)
     dwells: tuple[float, ...] | None = None
     until: int = 0
 

@@ -8,8 +8,9 @@ with the last level and correction, and ends at rest, whatever becomes of the de
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from table_io.control.sweep_control import (
     MAX_SWEEP_CORRECTION,
     MIN_RATIO,
     RISE_SHARE,
+    SLOPE_POINTS,
     Curve,
     combine_levels,
     extrapolate_ratio,
@@ -48,6 +50,8 @@ from table_io.sequencer.state import SequencerState, Stage, SweepSearch
 PREVIEW_LEADS = 3.0  # lead times of the queue that are planned ahead of a decision
 COMMAND_SHARE = 0.98  # of the limits of the rig that a corrected command may use
 MAX_RESONANCE_LAG = 0.2  # in ln f between the peaks of one resonance, up and down
+MAX_FORESEEN_CHANGE = 0.4  # in ln(ratio) from the last points on: beyond is a jump
+KNOWN_SPAN = 0.3  # in ln f, of what an earlier pass says about the next part
 NOTCHED_SHARE = 0.998  # of the level of the profile: below it is reduced by a limit
 
 
@@ -78,7 +82,9 @@ def decide_sweep_level(state: SequencerState) -> SequencerState:
     """Measure the level over the last window, and append the next part of the test."""
     changed, level = state.trajectory.end, _measure_level(state)
     if level is not None:
-        sweep = replace(_sweep(state), levels=(*_sweep(state).levels, level))
+        sweep, number = _sweep(state), _config(state).find_pass(level.step)
+        passes = {**sweep.passes, number: (*sweep.passes.get(number, ()), level)}
+        sweep = replace(sweep, passes=passes)
         state = replace(state, sweep=sweep, records=(*state.records, level))
     return replace(_append_parts(state), changed_from=changed)
 
@@ -138,7 +144,7 @@ def _approach_next_dwell(state: SequencerState) -> SequencerState:
     """Rest, then start softly at the next resonance; end the test if there is none."""
     config, sweep, trajectory = _config(state), _sweep(state), state.trajectory
     if sweep.dwells is None:  # the passes are over
-        sweep = replace(sweep, dwells=_find_dwells(config, sweep.levels))
+        sweep = replace(sweep, dwells=_find_dwells(config, sweep.passes))
         if config.dwell_s:
             text = ", ".join(f"{hz:.4g} Hz" for hz in sweep.dwells or ()) or "none"
             event = Event(state.stage.last, "found", f"resonances: {text}")
@@ -151,7 +157,8 @@ def _approach_next_dwell(state: SequencerState) -> SequencerState:
     at_rest, before = replace(trajectory.target, level_m_s2=0.0), sweep.position
     step = config.find_window(min(before.sweep, config.passes - 1), before.frequency_hz)
     trajectory = trajectory.append_blend(at_rest, step, RAMP_CYCLES, Label.BLEND)
-    levels = _select_levels(state, number)
+    ahead = replace(sweep, position=replace(before, frequency_hz=f))
+    levels = _select_levels(replace(state, sweep=ahead), number)
     level = _limit_level(state, levels, f, None)
     target = SineTarget(f, level, _choose_correction(state, levels, f, level, None))
     step = config.find_window(number, f)
@@ -159,7 +166,7 @@ def _approach_next_dwell(state: SequencerState) -> SequencerState:
     sweep = SweepSearch(
         SweptPosition(number, f, SETTLE_UPDATES),
         trajectory.end,
-        sweep.levels,
+        sweep.passes,
         sweep.dwells[1:],
         trajectory.end + round(config.dwell_s * trajectory.rate_hz),
     )
@@ -185,7 +192,9 @@ def _plan_ahead(state: SequencerState) -> Drive:
     return trajectory.to_drive(())
 
 
-def _find_dwells(config: SweptSine, levels: Sequence[SweepLevel]) -> tuple[float, ...]:
+def _find_dwells(
+    config: SweptSine, passes: Mapping[int, Sequence[SweepLevel]]
+) -> tuple[float, ...]:
     """Return the frequencies in Hz at which to dwell, the largest resonances of the last pass.
 
     The response lags behind a moving frequency: where the pass before went the other way, the mean
@@ -194,9 +203,9 @@ def _find_dwells(config: SweptSine, levels: Sequence[SweepLevel]) -> tuple[float
     if not config.dwell_s:
         return ()
     last = config.passes - 1
-    peaks, before = find_pass_resonances(config, levels, last), []
+    peaks, before = find_pass_resonances(config, passes.get(last, ())), []
     if last and config.direction(last - 1) != config.direction(last):
-        before = [hz for hz, _ in find_pass_resonances(config, levels, last - 1)]
+        before = [hz for hz, _ in find_pass_resonances(config, passes.get(last - 1, ()))]
     dwells = []
     for hz, _ in peaks[:MAX_DWELLS]:
         other = min(before, key=lambda f: abs(math.log(f / hz)), default=hz)
@@ -244,18 +253,20 @@ def _list_notches(state: SequencerState) -> list[LimitConfig]:
 class _PassLevels(NamedTuple):
     """Levels measured in a pass or dwell so far, and those of the pass before it."""
 
+    sweep: int
     own: list[SweepLevel]
     earlier: list[SweepLevel]
 
 
 def _select_levels(state: SequencerState, sweep: int) -> _PassLevels:
-    config, levels = _config(state), _sweep(state).levels
-    before = min(sweep, config.passes) - 1
-    own, earlier = (
-        [level for level in levels if config.find_pass(level.step) == number]
-        for number in (sweep, before)
-    )
-    return _PassLevels(own, earlier)
+    config, passes = _config(state), _sweep(state).passes
+    f, before = _sweep(state).position.frequency_hz, min(sweep, config.passes) - 1
+    earlier = [
+        level
+        for level in passes.get(before, ())
+        if abs(math.log(level.frequency_hz / f)) < KNOWN_SPAN
+    ]
+    return _PassLevels(sweep, list(passes.get(sweep, ())[-SLOPE_POINTS:]), earlier)
 
 
 def _known_gain(state: SequencerState, earlier: Sequence[SweepLevel]) -> Curve:
@@ -282,13 +293,40 @@ def _limit_level(
         points = list_ratio_points(levels.own, entry.channel)
         known = make_curve(list_ratio_points(levels.earlier, entry.channel))
         if points or levels.earlier:
-            ratio = math.exp(extrapolate_ratio(points, known, math.log(frequency_hz)))
-            share = min(share, LIMIT_SHARE * entry.limit_si / (ratio * reference))
+            ln_f = math.log(frequency_hz)
+            ratio = extrapolate_ratio(points, known, ln_f)
+            foreseen = _foresee_ratio(config, levels, entry.channel, points, ln_f)
+            ratio = foreseen if math.isfinite(foreseen) else ratio
+            share = min(share, LIMIT_SHARE * entry.limit_si / (math.exp(ratio) * reference))
+    if config.predicted is not None:
+        predicted = config.predicted.level_m_s2(levels.sweep, frequency_hz)
+        share = min(share, predicted / reference) if math.isfinite(predicted) else share
     if before is not None and before.level_m_s2:
         last = before.level_m_s2 / config.level_m_s2(before.frequency_hz)
         fall = 10.0 ** (config.clamp_db / 20.0)
         share = min(max(share, last / fall), last * fall**RISE_SHARE)
     return reference * share
+
+
+def _foresee_ratio(
+    config: SweptSine,
+    levels: _PassLevels,
+    channel: str,
+    points: list[tuple[float, float]],
+    ln_f: float,
+) -> float:
+    """Return ln of a channel over the level at ln f by the twin and the measured difference to it.
+
+    NaN without a prediction, or where that jumps on the way: the specimen jumps at another place.
+    """
+    if config.predicted is None or not points:
+        return math.nan
+
+    predict = partial(config.predicted.log_ratio, levels.sweep, channel)
+    jumps = [abs(predict(ln_f) - predict(at)) for at, _ in points]
+    if not all(jump < MAX_FORESEEN_CHANGE for jump in jumps):
+        return math.nan
+    return extrapolate_ratio(points, predict, ln_f)
 
 
 def _choose_correction(

@@ -37,6 +37,7 @@ TASKS = {
     "replay": ("replay",),
     "report": ("write_folder_report",),
     "runs": ("index_runs",),
+    "record": ("compute_spectrum_records",),
     "catalog": ("update_catalog",),
     "fleet": ("run_fleet",),
     "note": ("note_run",),

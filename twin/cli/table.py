@@ -80,6 +80,7 @@ class Command:
 COMMANDS = (
     Command("run", DRIVE, "twin.monitor.cli:run_command", computes=True),
     Command("table-drive", PLAN, "twin.earthquakes.cli:table_drive_command", computes=True),
+    Command("record", PLAN, "twin.earthquakes.cli:record_command", computes=True),
     Command("demo", DRIVE, "twin.demo.cli:demo_command", computes=True),
     Command("campaign", DRIVE, "twin.campaign.cli:campaign_command", computes=True),
     Command("table", DRIVE, "twin.rig.cli:table_command"),
@@ -125,6 +126,9 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "table-drive": (
         "table-drive el_centro --table-twin table.toml --iterate 3",
         "table-drive el_centro --table-twin table.toml --after runs/first --out next"),
+    "record": (
+        "record rrs.csv --like swept_sine --out rrs",
+        "record rrs.csv --like my_test.toml --strong 15 --count 3"),
     "demo": ("demo", "demo --seed 3 --keep my_rig --no-open"),
     "campaign": (
         "campaign records --speed max --yes --out records_runs",

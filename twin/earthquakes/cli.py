@@ -93,3 +93,37 @@ def table_twin_command(
 
     options = TableTwinOptions(tuple(logs), with_effects, tuple(judge or ()), band_hz)
     raise typer.Exit(identify_table_command(options, out, json))
+
+
+def record_command(
+    spectrum: Annotated[
+        Path,
+        typer.Argument(metavar="SPECTRUM", help="CSV file with `frequency_hz` and `sa_g`."),
+    ],
+    like: Annotated[
+        Path,
+        typer.Option(
+            "--like", metavar="PROFILE", help="Test that gives rig, model, specimen and sampling."
+        ),
+    ],
+    out: OutOption = None,
+    table: TableOption = None,
+    duration_s: Annotated[
+        float, typer.Option("--duration", min=1.0, max=600.0, help="In s.")
+    ] = 30.0,
+    strong_s: Annotated[float, typer.Option("--strong", help="Strong part in s.")] = 20.0,
+    rise_s: Annotated[float, typer.Option("--rise", help="Before the strong part, in s.")] = 4.0,
+    damping: Annotated[float, typer.Option(min=0.001, max=0.5, help="Ratio.")] = 0.05,
+    aim: Annotated[
+        float, typer.Option(min=0.5, max=2.0, help="Ordinates over the required ones, about.")
+    ] = 1.08,
+    seed: Annotated[int, typer.Option(min=0, help="Of the random phases.")] = 1,
+    count: Annotated[int, typer.Option(min=1, max=20, help="Records.")] = 1,
+) -> None:
+    """Make records compatible with a required response spectrum, and a test of each."""
+    from twin.earthquakes.command import make_records_command
+    from twin.earthquakes.spectrum_record import RecordShape, SpectrumRecordOptions
+
+    shape = RecordShape(duration_s, strong_s, rise_s, damping, aim, seed, count)
+    options = SpectrumRecordOptions(spectrum, like, shape, table)
+    raise typer.Exit(make_records_command(options, out))

@@ -8,6 +8,7 @@ from rich.table import Table
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
+from table_io.units import GRAVITY_M_S2
 from twin.earthquakes.figures import draw_table_twin
 from twin.earthquakes.result import (
     PROFILE_FILE,
@@ -15,6 +16,11 @@ from twin.earthquakes.result import (
     JudgedErrors,
     TableTwinReport,
     TableTwinResult,
+)
+from twin.earthquakes.spectrum_record import (
+    SpectrumRecord,
+    SpectrumRecordOptions,
+    compute_spectrum_records,
 )
 from twin.earthquakes.table_effects import LIBRARY, describe_discovery
 from twin.earthquakes.table_identification import TableIdentification
@@ -30,7 +36,7 @@ from twin.live.run_command import run_test
 from twin.results.recordings import open_recording
 from twin.results.table_motion import summarise_tracking
 from twin.setup.folders import make_output_folder
-from twin.setup.run_config import make_run_id
+from twin.setup.run_config import make_run_id, read_run_config
 from twin.system.terminal import console, error_console, print_line, print_table, show_status
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
@@ -183,3 +189,41 @@ def _iterate(
     best = int(np.argmin(errors))
     print_line(f"best drive: {folder / f'drive-{best}' / PROFILE_FILE}")
     return 0
+
+
+def make_records_command(options: SpectrumRecordOptions, out: Path | None) -> int:
+    """Write records of a required spectrum with their tests; 2 if the rig cannot play one."""
+    folder = make_output_folder(out, make_run_id(f"records-{options.spectrum.stem}"))
+    with show_status("matching the required spectrum") as show_part:
+        result = compute_spectrum_records(options, show_part)
+    paths = result.save(folder)
+    refused = 0
+    for record, path in zip(result.records, paths, strict=True):
+        print_line(
+            f"{path.name}: {record.ratios.min():.3f} to {record.ratios.max():.3f} of the required "
+            f"spectrum at {record.ratios.size} ordinates, PGA "
+            f"{record.pga_m_s2 / GRAVITY_M_S2:.3g} g, {record.significant_s:.3g} s from 5 to 95 % "
+            "of its energy"
+        )
+        try:
+            _check_record(record, path)
+        except InputError as error:
+            refused += 1
+            error_console.print(str(error), highlight=False, soft_wrap=True)
+    if len(paths) > 1:
+        print_line(f"largest correlation of two records: {result.largest_correlation:.2g}")
+    print_line(f"next: shaketwin table-drive {paths[0]} --table-twin FILE")
+    return REFUSED_CODE if refused else 0
+
+
+def _check_record(record: SpectrumRecord, profile: Path) -> None:
+    """Raise InputError if a record misses its spectrum, or its test is beyond the rig."""
+    config = read_run_config(profile).profile.tracking
+    low, high = float(record.ratios.min()), float(record.ratios.max())
+    if low < config.required_lower or high > config.required_upper:
+        raise InputError(
+            f"no record found: the ordinates lie from {low:.3f} to {high:.3f} of the required ones",
+            where=profile,
+            allowed=f"{config.required_lower:g} to {config.required_upper:g}",
+            remedy="a spectrum this steep belongs to no motion of this damping: make it flatter",
+        )

@@ -85,6 +85,7 @@ CHAPTERS = (
             _page("archive", "An archive of runs"),
             _page("while-it-runs", "While a test runs"),
             _page("earthquakes", "Earthquakes"),
+            _page("qualification", "A qualification test"),
             _page("studies", "Studies over parameters"),
         ),
     ),

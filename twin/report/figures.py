@@ -38,6 +38,7 @@ from twin.drawing.prc_drawing import (
     shade_precompression,
 )
 from twin.drawing.step_figures import draw_histories, draw_legend, draw_loop_figures
+from twin.drawing.sweep_figure import draw_swept_sine
 from twin.drawing.table_motion_figures import draw_table_motion
 from twin.drawing.window_figure import draw_window_histories
 from twin.dynamics.main_branches import follow_sweep_branches
@@ -58,6 +59,7 @@ MARKER_SIZES = {"forward": 4.6, "backward": 2.6}  # both show where they coincid
 def draw_figures(run: ReportData) -> CaptionedFigures:
     """Yield all figures for which the run has data, in report order."""
     for draw in (
+        draw_swept_sine,
         draw_orbits,
         _draw_prc,
         _draw_model_branches,

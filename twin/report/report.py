@@ -38,6 +38,7 @@ from twin.results.report_data import (
 )
 from twin.results.sensor_table import build_sensor_rows
 from twin.results.summary import parse_toml_tables
+from twin.results.swept_sine import format_swept_sine
 from twin.results.table_motion import format_required, format_tracking
 from twin.results.twin_verdict import (
     describe_worst,
@@ -180,6 +181,8 @@ def format_orbit_headline(
 
 def format_headline(run: ReportData) -> str:
     """Format the headline: steps completed, hysteresis, findings and largest excursion."""
+    if run.summary.swept_sine is not None:
+        return f"{format_swept_sine(run.summary.swept_sine)}."
     if run.windows:
         planned = parse_toml_tables(run.recording.start.profile_toml).get("excitation") or {}
         kind = planned.get("kind", "history")

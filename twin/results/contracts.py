@@ -398,6 +398,9 @@ class SweptPoint(Contract):
     demanded_m_s2: RealAcceleration = Field(description="what limits leave of it")
     achieved_m_s2: RealAcceleration = Field(description="by the control channels")
     limited_by: str = Field(description="channel whose limit reduces the level; empty: none")
+    predicted_m_s2: RealAcceleration = Field(
+        math.nan, description="level by the twin before the run; null without a notch"
+    )
 
 
 class ResonanceEntry(Contract):

@@ -1,7 +1,8 @@
 """The verdict on the excitation of a run, said once: did the table play the test?
 
 A stepped sine is reached if the fundamental of the table acceleration is within the profile's
-`protection.alarm` of the demanded level at every step; a record if its peak is within
+`protection.alarm` of the demanded level at every step, a swept sine if it is for MIN_INSIDE of the
+time of all its passes; a record if its peak is within
 `tracking.required_lower` to `required_upper` of the target's, its rms error is small enough, and a
 required spectrum is met.
 """
@@ -10,11 +11,18 @@ import math
 from collections.abc import Iterable
 
 from table_io.config.profile import Profile
-from twin.results.contracts import ExcitationVerdict, RunSummary, StepEntry, TrackingResult
+from twin.results.contracts import (
+    ExcitationVerdict,
+    RunSummary,
+    StepEntry,
+    SweptSineResult,
+    TrackingResult,
+)
 
 # Of the rms of the target's acceleration, in the band that is judged: beyond it the table has
 # played another record, whatever its peak.
 MAX_RECORD_ERROR = 0.3
+MIN_INSIDE = 0.95  # of the time of a swept sine: the rest is for jumps of the specimen
 MAX_PEAK_EXCESS = 0.05  # of the table's peak over its fundamental: half of what harmonics of 8 % do
 MIN_DISTORTION = 0.03  # THD above which a raised peak is that of harmonics, not of noise
 
@@ -25,6 +33,8 @@ def judge_excitation(summary: RunSummary, profile: Profile) -> ExcitationVerdict
         return _decline("no table was driven")
     if summary.tracking:
         return _judge_record(summary.tracking, profile)
+    if summary.swept_sine is not None:
+        return _judge_swept_sine(summary.swept_sine)
     known = list_level_errors(summary.steps)
     if not known:
         return _decline("the level of no step is known")
@@ -38,6 +48,31 @@ def judge_excitation(summary: RunSummary, profile: Profile) -> ExcitationVerdict
         reason += f", worst {place}"
     return ExcitationVerdict(
         verdict="missed" if outside else "reached",
+        reason=reason,
+        outside=outside,
+        worst_error=error,
+    )
+
+
+def _judge_swept_sine(swept: SweptSineResult) -> ExcitationVerdict:
+    """Return the verdict on a swept sine: all passes played, and the level held for the time."""
+    errors = [
+        (point.achieved_m_s2 / point.demanded_m_s2 - 1.0, point)
+        for point in swept.points
+        if point.direction != "dwell"
+    ]
+    outside = sum(abs(error) > swept.tolerance for error, _ in errors)
+    error, worst = max(errors, key=lambda entry: abs(entry[0]))
+    is_whole = swept.passes == swept.planned_passes
+    reason = (
+        f"level within {100 * swept.tolerance:g} % for {100 * swept.inside:.4g} % of the time, "
+        f"worst {100 * error:+.2g} % at {worst.frequency_hz:.3g} Hz {worst.direction}"
+    )
+    if not is_whole:
+        reason = f"{swept.passes} of {swept.planned_passes} passes; {reason}"
+    is_reached = is_whole and swept.inside >= MIN_INSIDE
+    return ExcitationVerdict(
+        verdict="reached" if is_reached else "missed",
         reason=reason,
         outside=outside,
         worst_error=error,

@@ -62,6 +62,11 @@ def _describe_point(level: SweepLevel, config: SweptSine, rate_hz: float) -> Swe
         demanded_m_s2=level.demanded_m_s2,
         achieved_m_s2=level.measured_m_s2,
         limited_by=level.limited_by,
+        predicted_m_s2=(
+            math.nan
+            if config.predicted is None
+            else config.predicted.level_m_s2(sweep, level.frequency_hz)
+        ),
     )
 
 
@@ -75,7 +80,9 @@ def _list_resonances(levels: tuple[SweepLevel, ...], config: SweptSine) -> list[
             amplification=ratio,
         )
         for sweep in range(config.passes)
-        for hz, ratio in find_pass_resonances(config, levels, sweep)
+        for hz, ratio in find_pass_resonances(
+            config, [level for level in levels if config.find_pass(level.step) == sweep]
+        )
     ]
 
 

@@ -231,6 +231,11 @@ def build_run_config(
         if error.key != "rate_hz":
             raise
         raise error.replace(remedy=f"{error.remedy}, or correct {model_path}") from None
+    if config.profile.swept_sine is not None:
+        from twin.setup.swept_prediction import attach_prediction
+
+        if (predicted_toml := attach_prediction(config)) != profile_toml:
+            config = from_texts(name, predicted_toml, rig_toml, model_toml, source)
     check_drive_rig(config.profile, config.rig, source)
     check_tare(config.rig, config.profile.specimen.gaps_m, source, local_datetime())
     try:

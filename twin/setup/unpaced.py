@@ -28,6 +28,7 @@ from twin.compare import pipeline
 from twin.recording.mcap_log import LogWriter
 from twin.setup.realtime import check_full_speed
 from twin.setup.run_config import RunConfig
+from twin.setup.swept_prediction import generate_swept_twin
 from twin.transport.codec import Item, encode_item, topic_for
 
 ItemHandler = Callable[[Item], None]
@@ -142,6 +143,8 @@ def simulate_ideal(config: RunConfig, run: str, path: Path, on_item: ItemHandler
 
 def generate_ideal_twin(config: RunConfig, run: str = "") -> Iterator[Item]:
     """Yield the items of an ideal table, each followed by the twin's items for it."""
+    if config.profile.swept_sine is not None:
+        return generate_swept_twin(config, run)
     return add_twin_items(_generate_ideal(config, run), config.prepare_twin(from_rest=True))
 
 

@@ -109,7 +109,9 @@ class RunProgress:
         elif isinstance(item, OrbitPoint):
             self._print_orbit(item)
         elif isinstance(item, SweepLevel):
-            self._print_sweep(item)
+            if item.step != self._sweep_part:  # the first level of each part
+                self.print_line(f"{item.step:>7}  {(format_record(item, 1.0) or ('', ''))[1]}")
+            self._sweep_part = item.step
         elif isinstance(item, StepAdded):
             self._steps = max(self._steps, item.step + 1)
         elif isinstance(item, Event):
@@ -143,13 +145,6 @@ class RunProgress:
                 f"{'':>7}  gap: more samples of {name} {gap.reason}; the next are shown after "
                 f"{GAP_SERIES_SAMPLES} valid samples"
             )
-
-    def _print_sweep(self, level: SweepLevel) -> None:
-        """Print the first level of each part of a swept sine."""
-        if level.step != self._sweep_part:
-            self._sweep_part = level.step
-            message = format_record(level, 1.0)
-            self.print_line(f"{level.step:>7}  {message[1] if message else ''}")
 
     def _print_orbit(self, orbit: OrbitPoint) -> None:
         """Print how many of the planned orbits are measured, and the newest."""

@@ -7,12 +7,22 @@ with action "notch" reduces it. After the passes the table may dwell at the reso
 """
 
 import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.config.base import Count, NonNegative, Number, Positive
+from table_io.block import Float2D
+from table_io.config.base import (
+    Count,
+    NonNegative,
+    Number,
+    Positive,
+    find_attached_text,
+)
 from table_io.config.excitation import Excitation, ExcitationPlan, register_excitation
 from table_io.config.excitation.waveform import (
     LevelPoints,
@@ -20,6 +30,7 @@ from table_io.config.excitation.waveform import (
     interpolate_level,
 )
 from table_io.errors import InputError
+from table_io.records import SweepLevel
 from table_io.units import GRAVITY_M_S2
 
 TABLE_ACCELERATION = "table_acc_m_s2"
@@ -35,6 +46,7 @@ TRACKED_CYCLES, MIN_TRACKED_S = 2.0, 0.1  # from which a level is measured
 class SweptSine(Excitation):
     """Logarithmic sine sweep at a controlled level, then dwells at the resonances found."""
 
+    FILE_KEYS: ClassVar[tuple[str, ...]] = ("prediction",)
     LEVEL_KEY: ClassVar[str] = "scale"
 
     start_hz: Positive = Field(ge=0.1, description="Lowest frequency.")
@@ -77,6 +89,12 @@ class SweptSine(Excitation):
     dwell_s: NonNegative = Field(
         0.0, le=7200, description="Endurance at each resonance found, the largest four at most."
     )
+    files: dict[str, str] = Field({}, description="Texts of files by name; loading attaches them.")
+    prediction: str | None = Field(
+        None,
+        description="CSV of the level and the responses by the specimen's twin; it is computed "
+        "and attached where the test has a notch.",
+    )
 
     @field_validator("stop_hz")
     @classmethod
@@ -107,6 +125,21 @@ class SweptSine(Excitation):
                 allowed="accelerations (_m_s2) and displacements (_m), each once",
             )
         return names
+
+    @field_validator("prediction")
+    @classmethod
+    def _check_prediction(cls, name: str | None, info: ValidationInfo) -> str | None:
+        text = find_attached_text(name, info)
+        if text is not None:
+            PredictedSweep.from_csv(text, str(name))
+        return name
+
+    @cached_property
+    def predicted(self) -> "PredictedSweep | None":
+        """Level and responses by the specimen's twin; None if none are attached."""
+        if self.prediction is None or self.prediction not in self.files:
+            return None
+        return PredictedSweep.from_csv(self.files[self.prediction], self.prediction)
 
     @property
     def passes(self) -> int:
@@ -200,3 +233,102 @@ class SweptSine(Excitation):
             windows=self.passes * self.windows_per_pass + (MAX_DWELLS if self.dwell_s else 0),
             swept_disp_m=float((levels / (math.tau * grid) ** 2).max()),
         )
+
+
+MIN_AMPLITUDE = 1e-12  # SI, of a channel that does not move
+PREDICTION_COLUMNS = ("sweep", "frequency_hz", "level_m_s2")
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedSweep:
+    """Swept sine on the twin of the specimen: `table` is (point, column), in order of time.
+
+    Its columns are PREDICTION_COLUMNS and then the fundamentals of `channels`, SI.
+    """
+
+    channels: tuple[str, ...]
+    table: Float2D
+
+    @classmethod
+    def from_levels(
+        cls, config: SweptSine, levels: Sequence[SweepLevel], per_octave: int
+    ) -> "PredictedSweep":
+        """Return the prediction of simulated levels, thinned to so many points an octave."""
+        rows: list[tuple[float, ...]] = []
+        for level in levels:
+            sweep = config.find_pass(level.step)
+            octaves = abs(math.log2(level.frequency_hz / rows[-1][1])) if rows else math.inf
+            if not rows or sweep != rows[-1][0] or octaves > 1.0 / per_octave:
+                rows.append((sweep, level.frequency_hz, level.demanded_m_s2, *level.amplitudes))
+        channels = levels[0].channels if levels else ()
+        return cls(channels, np.array(rows).reshape(-1, len(PREDICTION_COLUMNS) + len(channels)))
+
+    @classmethod
+    def from_csv(cls, text: str, name: str) -> "PredictedSweep":
+        """Parse the text of a prediction; InputError if it is none."""
+        header, *lines = text.strip().split("\n")
+        columns = tuple(header.split(","))
+        try:
+            if columns[: len(PREDICTION_COLUMNS)] != PREDICTION_COLUMNS:
+                raise ValueError(header)
+            table = np.array([[float(cell) for cell in line.split(",")] for line in lines])
+            return cls(columns[len(PREDICTION_COLUMNS) :], table.reshape(-1, len(columns)))
+        except ValueError:
+            raise InputError(
+                f"{name} is no prediction of a swept sine",
+                allowed=f"the columns {', '.join(PREDICTION_COLUMNS)} and channels",
+                remedy="remove `prediction`: it is computed again",
+            ) from None
+
+    def to_csv(self) -> str:
+        """Return the text of the file."""
+        rows = (",".join(f"{cell:.6g}" for cell in row) for row in self.table.tolist())
+        return "\n".join([",".join((*PREDICTION_COLUMNS, *self.channels)), *rows]) + "\n"
+
+    @cached_property
+    def _curves(self) -> dict[int, Float2D]:
+        """Logarithms of the columns from frequency on, by pass, f ascending, (column, point)."""
+        curves = {}
+        for sweep in np.unique(self.table[:, 0]).tolist():
+            rows = self.table[self.table[:, 0] == sweep]
+            columns = np.maximum(rows[np.argsort(rows[:, 1]), 1:], MIN_AMPLITUDE)
+            curves[int(sweep)] = np.log(columns).T
+        return curves
+
+    def level_m_s2(self, sweep: int, frequency_hz: float) -> float:
+        """Return the predicted level in m/s2 of a pass at a frequency; NaN outside it."""
+        ln_f = math.log(frequency_hz)
+        curve = self._curves.get(sweep)
+        if curve is None or not curve[0, 0] <= ln_f <= curve[0, -1]:
+            return math.nan
+        return float(np.exp(np.interp(ln_f, curve[0], curve[1])))
+
+    def log_ratio(self, sweep: int, channel: str, ln_f: float) -> float:
+        """Return ln of a channel's amplitude over the level of a pass at ln f; NaN if unknown."""
+        curve = self._curves.get(sweep)
+        if curve is None or channel not in self.channels:
+            return math.nan
+        row = 2 + self.channels.index(channel)
+        return float(np.interp(ln_f, curve[0], curve[row] - curve[1]))
+
+    def reduce_before_excess(
+        self, limits: Mapping[str, float], share: float, span: float
+    ) -> "PredictedSweep":
+        """Return the prediction with lower levels where a channel goes beyond its limit, SI.
+
+        There, and within `span` of ln f before it, the level is at most what would have left this
+        share of the limit: a jump of the specimen is met with the level that it needs afterwards.
+        """
+        table, ln_f = self.table.copy(), np.log(self.table[:, 1])
+        columns = [
+            (len(PREDICTION_COLUMNS) + self.channels.index(name), limit)
+            for name, limit in limits.items()
+        ]
+        for row in range(len(table)):
+            excess = max(self.table[row, column] / limit for column, limit in columns)
+            if excess > 1.0:
+                before = (np.arange(len(table)) <= row) & (table[:, 0] == table[row, 0])
+                before &= np.abs(ln_f - ln_f[row]) <= span
+                highest = share * self.table[row, 2] / excess
+                table[before, 2] = np.minimum(table[before, 2], highest)
+        return PredictedSweep(self.channels, table)

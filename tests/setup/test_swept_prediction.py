@@ -1,0 +1,77 @@
+"""Notch of a swept sine by the twin before the run: its limit kept, and the run close to it."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from table_io.config.base import PROFILES_DIR
+from table_io.records import SweepLevel
+from tests.builders.sessions import play_session
+from twin.setup.run_config import RunConfig, read_run_config
+
+GRAVITY_M_S2 = 9.80665
+LIMIT_G = 0.09
+PROFILE = """
+title = "notched"
+rig = "simulated"
+model = "snm"
+specimen = { mass_kg = 550.0, gap_mm = inf }
+acquisition = { rate_hz = 1000.0 }
+limits = [{ channel = "mass_acc_m_s2", limit = 0.09, unit = "g", action = "notch" }]
+
+[excitation]
+kind = "swept_sine"
+start_hz = 0.8
+stop_hz = 2.5
+octaves_per_min = 0.5
+acceleration_g = 0.05
+directions = ["forward"]
+"""
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> RunConfig:
+    path = tmp_path_factory.mktemp("notched") / "notched.toml"
+    path.write_text(PROFILE, encoding="utf-8")
+    return read_run_config(path)
+
+
+def find_gain(model_hz: float) -> float:
+    """Return the absolute acceleration of the mass over that of the table, linear specimen."""
+    w, k, c, m = math.tau * model_hz, 36e3, 1.1e3, 550.0
+    return abs((k + 1j * w * c) / (k - m * w**2 + 1j * w * c))
+
+
+def test_prediction_is_the_level_that_keeps_the_limit(config: RunConfig) -> None:
+    swept = config.profile.swept_sine
+    assert swept is not None
+    assert swept.predicted is not None
+    for hz in (0.9, 1.15, 1.29, 1.5, 2.3):
+        steady = min(0.05, LIMIT_G / find_gain(hz)) * GRAVITY_M_S2
+        assert swept.predicted.level_m_s2(0, hz) == pytest.approx(steady, rel=0.1)
+    table = swept.predicted.table
+    mass = table[:, 3 + swept.predicted.channels.index("mass_acc_m_s2")]
+    assert mass.max() < 1.02 * LIMIT_G * GRAVITY_M_S2
+
+
+def test_run_plays_the_predicted_notch(config: RunConfig) -> None:
+    swept = config.profile.swept_sine
+    assert swept is not None
+    assert swept.predicted is not None
+    played = play_session(config.profile, joins_blocks=True)
+    ratios, mass = [], []
+    for level in played.select(SweepLevel):
+        predicted = swept.predicted.level_m_s2(0, level.frequency_hz)
+        if math.isfinite(predicted):
+            ratios.append(level.measured_m_s2 / predicted)
+        mass.append(level.amplitudes[level.channels.index("mass_acc_m_s2")])
+    assert np.abs(np.array(ratios) - 1.0).max() < 0.05
+    assert max(mass) < 1.03 * LIMIT_G * GRAVITY_M_S2
+
+
+def test_prediction_travels_with_the_profile_and_is_not_computed_again(config: RunConfig) -> None:
+    assert "prediction.csv" in config.profile_toml
+    path = Path(PROFILES_DIR) / "tests" / "g10.toml"
+    assert read_run_config(path).profile.swept_sine is None
