@@ -59,6 +59,7 @@ from table_io.safety.sample_checks import (
 )
 from table_io.safety.thresholds import Thresholds, compute_thresholds
 from table_io.sensor_errors import highpass
+from table_io.units import GRAVITY_M_S2
 
 FIRST_HOLD_KEY = 2  # keys from here on are motions of constant frequency and level
 MIN_CYCLE_COUNT = 1.0 - 1e-3  # cycles that count as a whole one
@@ -280,6 +281,7 @@ MAX_RECORD_RATIO = 1.3  # of the table's acceleration over the envelope of its t
 # The envelope of a target is its largest acceleration within this time before and after, and no
 # less than this share of its peak: impacts and friction add to quiet parts.
 ENVELOPE_S, MIN_ENVELOPE_RATIO = 0.25, 0.5
+FRICTION_SHARE = 0.5  # of the least level that a rig with friction asks for: its friction
 HISTORY_KEY = 0.5  # motion without cycles
 NEVER = -(2**62)  # sample before any episode
 HELD_LABELS = (Label.SETTLE, Label.MEASURE, Label.CHECK)
@@ -357,17 +359,18 @@ def start_protection(
         make_sample_state(channel_count),
         0,
         history,
-        record_limit=_limit_record(profile),
+        record_limit=_limit_record(profile, rig),
         last_beyond=(NEVER,) * len(profile.limits),
     )
     _warm_up_kernel(state)
     return state
 
 
-def _limit_record(profile: Profile) -> Float1D:
+def _limit_record(profile: Profile, rig: RigConfig) -> Float1D:
     """Return the largest acceleration of the table that a drive allows in m/s2, (sample,).
 
-    Empty without a drive: a history played open loop is off its target as the table is.
+    Friction adds to it what is in no proportion to the target. Empty without a drive: a history
+    played open loop is off its target as the table is.
     """
     excitation, rate_hz = profile.excitation, profile.acquisition.rate_hz
     if not isinstance(excitation, History) or excitation.drive is None:
@@ -376,7 +379,8 @@ def _limit_record(profile: Profile) -> Float1D:
 
     size = np.abs(history_acceleration(profile.plan.target_m, rate_hz))
     envelope = maximum_filter1d(size, 2 * math.ceil(ENVELOPE_S * rate_hz) + 1)
-    return MAX_RECORD_RATIO * np.maximum(envelope, MIN_ENVELOPE_RATIO * size.max())
+    friction = FRICTION_SHARE * rig.table_response.least_level_g * GRAVITY_M_S2
+    return MAX_RECORD_RATIO * np.maximum(envelope, MIN_ENVELOPE_RATIO * size.max()) + friction
 
 
 def _check_channel_limits(
