@@ -88,7 +88,8 @@ def render_figure(figure: PanelFigure | Figure) -> Figure:
     """Return the matplotlib figure of panels."""
     if isinstance(figure, Figure):
         return figure
-    rendered = Figure(figsize=figure.size_in, layout="none")
+    rendered = Figure(figsize=figure.size_in)
+    rendered.set_layout_engine("none")
     rows, columns = figure.panels.shape
     axes = rendered.subplots(
         rows, columns, sharex=figure.sharex, sharey=figure.sharey, squeeze=False,
