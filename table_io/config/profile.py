@@ -163,6 +163,19 @@ class ProtectionConfig(ConfigModel):
     )
 
 
+class CustomerConfig(ConfigModel):
+    """Texts of the customer's report of a test."""
+
+    laboratory: str = Field("", description="Name and address of the laboratory.")
+    customer: str = Field("", description="Name of the customer.")
+    order: str = Field("", description="Number of the order.")
+    specimen: str = Field("", description="Specimen: type, serial number, mounting.")
+    specification: str = Field("", description="What the test is to meet, in the customer's words.")
+    signatures: tuple[str, ...] = Field(
+        ("Test engineer", "Head of the laboratory"), max_length=6, description="Who signs."
+    )
+
+
 class SetUpConfirmation(ConfigModel):
     """Setup that the operator was asked for before a run, and the operator's confirmation."""
 
@@ -207,6 +220,7 @@ class Profile(ConfigModel):
     dwell: DwellConfig | None = None
     track: TrackConfig | None = None
     refine: RefineConfig | None = None
+    customer: CustomerConfig = CustomerConfig()
     set_up: SetUpConfirmation | None = None
     resume: ResumeConfig | None = None
 

@@ -141,7 +141,10 @@ def check_cycle(
         part.is_half_cycle and part.key == span.key for part in last
     )
     if len(last) == 2 and steady:
-        state, steady_suspicions = _check_steady_motion(state, _join_spans(context, last))
+        cycle = _join_spans(context, last)
+        if context.profile.swept_sine is not None:  # the level of a notch moves: that in the middle
+            cycle = replace(cycle, level=last[0].level)
+        state, steady_suspicions = _check_steady_motion(state, cycle)
         suspicions += steady_suspicions
     streaks = {suspicion.key: state.streaks.get(suspicion.key, 0) + 1 for suspicion in suspicions}
     confirmed = [

@@ -36,11 +36,13 @@ def draw_swept_sine(run: ReportData) -> CaptionedFigures:
         f, demanded, achieved, predicted = np.array(
             [(p.frequency_hz, p.demanded_m_s2, p.achieved_m_s2, p.predicted_m_s2) for p in points]
         ).T
-        name = f"achieved, {direction}" if direction not in labelled else "_"
-        if np.isfinite(predicted).any():
-            text = "predicted notch" if not labelled else "_"
-            level.plot(f, predicted / GRAVITY_M_S2, color=PREDICTED_COLOUR, lw=1.0, label=text)
-        level.plot(f, achieved / GRAVITY_M_S2, label=name, **style)
+        foreseen = np.isfinite(predicted)
+        if foreseen.any():
+            label = {} if labelled else {"label": "predicted notch"}
+            predicted_g = predicted[foreseen] / GRAVITY_M_S2
+            level.plot(f[foreseen], predicted_g, color=PREDICTED_COLOUR, lw=1.0, **label)
+        label = {} if direction in labelled else {"label": f"achieved, {direction}"}
+        level.plot(f, achieved / GRAVITY_M_S2, **style, **label)
         ratio.plot(f, achieved / demanded, **style)
         labelled.add(direction)
     level.set_ylabel("level in g")

@@ -25,6 +25,7 @@ class ReportFormat(enum.StrEnum):
 
     html = "html"
     pdf = "pdf"
+    customer = "customer"
 
 
 def prc_command(
@@ -45,7 +46,10 @@ def report_command(
         ),
     ],
     output: Annotated[
-        ReportFormat, typer.Option("--format", help="Of a run, pdf writes report.pdf too.")
+        ReportFormat,
+        typer.Option(
+            "--format", help="Of a run: pdf writes report.pdf too, customer a test report as well."
+        ),
     ] = ReportFormat.html,
     figures: Annotated[
         bool, typer.Option("--figures", help="Also write each figure as SVG, PDF and CSV.")
@@ -54,7 +58,7 @@ def report_command(
     """Write the report of a run or campaign again: one self-contained HTML file."""
     from twin.inspection.folder_report import print_report
 
-    print_report(folder, output is ReportFormat.pdf, figures)
+    print_report(folder, output.value, figures)
 
 
 def view_command(

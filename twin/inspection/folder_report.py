@@ -17,20 +17,24 @@ FIGURE_FORMATS = ("svg", "pdf", "csv")  # next to PNG
 
 
 def write_folder_report(
-    folder: str | Path, as_pdf: bool = False, all_formats: bool = False
+    folder: str | Path,
+    as_pdf: bool = False,
+    all_formats: bool = False,
+    for_customer: bool = False,
 ) -> tuple[Path, ...]:
     """Rewrite report.html in the folder of a run, campaign, batch or map; return the new pages.
 
     A run or campaign is reported from its recordings, a batch from its table, a map from its
-    arrays. Of a run also report.pdf, and each figure in all formats, where asked for.
+    arrays. Of a run also report.pdf, each figure in all formats, and the customer's report as a
+    page and a PDF, where asked for.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; give the folder of a run or a batch")
     if (folder / PARTS_FOLDER).is_dir():
         merge_run_parts(folder)
-    if as_pdf or all_formats:
-        _require_run(folder, "--format pdf" if as_pdf else "--figures")
+    if as_pdf or all_formats or for_customer:
+        _require_run(folder, "--figures" if all_formats else "--format")
     # What draws pictures is slow to import: the report of a run waits for none of it.
     if (folder / STATE_FILE).is_file():
         from twin.campaign.report import write_campaign_report
@@ -59,12 +63,17 @@ def write_folder_report(
 
         pages.append(folder / "report.pdf")
         write_pdf_report(load_report_data(folder, recording), pages[-1])
+    if for_customer:
+        from twin.report.customer_report import write_customer_report
+
+        pages += write_customer_report(load_report_data(folder, recording), folder)
     return tuple(pages)
 
 
-def print_report(folder: Path, as_pdf: bool, all_formats: bool) -> None:
-    """Write the report of a folder again and print its pages."""
-    for page in write_folder_report(folder, as_pdf, all_formats):
+def print_report(folder: Path, output: str, all_formats: bool) -> None:
+    """Write the report of a folder again, "html", "pdf" or "customer", and print its pages."""
+    pages = write_folder_report(folder, output == "pdf", all_formats, output == "customer")
+    for page in pages:
         print_line(f"{page}")
 
 

@@ -1,0 +1,69 @@
+"""Customer's report: what it states is what the recording holds, and its PDF is a whole file."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.builders.rigs import make_faulty_rig
+from tests.builders.sessions import play_session
+from tests.command_line import call_main
+from tests.setup.test_swept_prediction import PROFILE
+from twin.inspection.folder_report import write_folder_report
+from twin.recording.reader import read_recording
+from twin.report.customer_report import build_customer_report
+from twin.report.report import load_report_data
+
+TEXTS = """
+[customer]
+laboratory = "Shake & Co"
+specimen = "Valve <7>"
+signatures = ["A. Engineer"]
+"""
+WIDE = 'limits = [{ channel = "mass_acc_m_s2", limit = 0.3, action = "stop" }]'
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A swept sine that a limit stops early."""
+    tmp = tmp_path_factory.mktemp("customer")
+    lines = [WIDE if line.startswith("limits") else line for line in PROFILE.splitlines()]
+    (tmp / "limited.toml").write_text("\n".join(lines) + TEXTS, encoding="utf-8")
+    ended = call_main("run", tmp / "limited.toml", "--speed", "max", "--out", tmp / "run")
+    assert ended.returncode == 3
+    return tmp / "run"
+
+
+def test_customer_report_states_texts_limits_and_the_stop(folder: Path) -> None:
+    report = build_customer_report(load_report_data(folder, read_recording(folder / "run.mcap")))
+    cover = dict(report.cover)
+    assert cover["Laboratory"] == "Shake & Co"
+    assert len(cover["Recording, SHA-256"]) == 64
+    sections = {section.title: section for section in report.sections}
+    assert ("Limit of mass_acc_m_s2", "0.3 SI: stop") in sections["Set-up"].rows
+    assert [row[0] for row in sections["Instruments"].rows][:2] == ["drive_disp_m", "table_disp_m"]
+    deviations = " ".join(sections["Deviations"].lines)
+    assert "The test was aborted" in deviations
+    assert "exceeds the limit of the test" in deviations
+    assert report.signatures == ("A. Engineer",)
+
+
+def test_customer_report_is_a_page_and_a_pdf(folder: Path) -> None:
+    pages = write_folder_report(folder, for_customer=True)
+    assert [page.name for page in pages] == ["report.html", "customer.html", "customer.pdf"]
+    html = pages[1].read_text(encoding="utf-8")
+    assert "Valve &lt;7&gt;" in html
+    assert "http://" not in html.replace("http://www.w3.org", "")
+    pdf = pages[2].read_bytes()
+    assert pdf.startswith(b"%PDF")
+    assert pdf.rstrip().endswith(b"%%EOF")
+    assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") >= 2
+
+
+def test_a_clean_test_has_no_deviations() -> None:
+    # A table that follows its sweep reports nothing: alarms would name a sensor that is sound.
+    from tests.table_io.acquisition.test_swept_sine import make_swept_profile
+
+    played = play_session(make_swept_profile(stop_hz=2.2), rig=make_faulty_rig(), joins_blocks=True)
+    assert played.stop.verdict == "complete"
+    assert not played.select_events("alarm")
+    assert not played.select_events("sensor")
