@@ -1,10 +1,11 @@
-"""Reader of HDF5 and MATLAB v7.3 files; only this file imports h5py.
+"""Reader of HDF5 and MATLAB v7.3 files, and writer of HDF5; only this file imports h5py.
 
 Datasets are named by their path; the cells of a cell array and the elements of a structure array
 of MATLAB as in `mat`. Links into other files are never followed.
 """
 
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from table_io.formats.table import (
 )
 from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, add_fact, find_fact, find_label
 
+Attributes = Mapping[str, str | list[str]]
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
 MAX_REFERENCES = 1000  # of a cell array
@@ -40,9 +42,9 @@ def scan_columns(path: Path) -> ForeignTable:
 
 def load_column(path: Path, key: ColumnKey) -> Any:
     """Read the values of a column, (row,)."""
-    name, field, k = key
+    name, part, k = key
     with h5py.File(path, "r") as file:
-        return extract_column(file[name][field or ()], int(k))
+        return extract_column(file[name][part or ()], int(k))
 
 
 def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
@@ -138,3 +140,39 @@ def _read_text(item: Any) -> str:
 
 def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NexusField:
+    """Field of a NeXus group: a text, a number or an array, with its attributes."""
+
+    name: str
+    value: Any
+    attributes: Attributes = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NexusGroup:
+    """Group of a NeXus file: its path, its class, attributes and fields."""
+
+    path: str
+    nx_class: str
+    attributes: Attributes
+    fields: Iterable[NexusField]
+
+
+def write_nexus(path: Path, groups: Iterable[NexusGroup]) -> None:
+    """Write groups as an HDF5 file in the layout of NeXus; arrays are compressed without loss."""
+    with h5py.File(path, "w") as file:
+        file.attrs["default"], file.attrs["creator"] = "entry", "shaketwin"
+        for group in groups:
+            place = file.create_group(group.path)
+            place.attrs["NX_class"] = group.nx_class
+            for name, text in group.attributes.items():
+                place.attrs[name] = text
+            for entry in group.fields:
+                is_array = isinstance(entry.value, np.ndarray)
+                options = {"compression": "gzip", "shuffle": True} if is_array else {}
+                dataset = place.create_dataset(entry.name, data=entry.value, **options)
+                for name, text in entry.attributes.items():
+                    dataset.attrs[name] = text

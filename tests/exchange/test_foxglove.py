@@ -1,6 +1,7 @@
 """What Foxglove gets: read by the library of MCAP, held against the log and Foxglove's schemas."""
 
 import json
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,10 @@ def out(both: tuple[Path, Path]) -> Path:
     return both[1]
 
 
+# The run started in local time: its record states no zone.
+STARTED_NS = round(datetime(2025, 1, 1).timestamp() * 1e9)
+
+
 def decode_messages(path: Path) -> dict[str, list[Any]]:
     """Every message by topic as (log_time, message), by the library's own reader and decoder."""
     reader = pytest.importorskip("mcap.reader")
@@ -50,7 +55,7 @@ def test_foxglove_gets_a_message_a_sample_at_its_time(
 ) -> None:
     index, values, *labels = measured(read_recording(log))
     (predicted,) = read_recording(log).contiguous_blocks("pred")
-    times = [round(sample * 1e9 / RATE) for sample in index.tolist()]
+    times = [STARTED_NS + round(sample * 1e9 / RATE) for sample in index.tolist()]
     for topic in ("/measured", "/twin"):
         assert [at for at, _ in messages[topic]] == times
         stamps = [
@@ -72,10 +77,11 @@ def test_foxglove_gets_the_events_as_its_own_log_and_the_curves(
     messages: dict[str, list[Any]],
 ) -> None:
     ((at, event),) = messages["/events"]
-    assert (at, event.message, event.name, event.level) == (0, "running", "state", 2)
+    assert (at, event.message, event.name, event.level) == (STARTED_NS, "running", "state", 2)
     assert event.DESCRIPTOR.full_name == "foxglove.Log"
     ((at, point),) = messages["/prc"]
-    assert (at, point.frequency_hz, point.eta_d, point.direction) == (3_000_000_000, 1.0, 0.1, 1)
+    assert at == STARTED_NS + 3_000_000_000
+    assert (point.frequency_hz, point.eta_d, point.direction) == (1.0, 0.1, 1)
     assert np.isnan(point.r_l)
     assert np.isnan(point.twin_eta_d)
 

@@ -137,6 +137,13 @@ def export_command(
             "--rrd", callback=require_view_extra, help="Rerun, with the project's layout."
         ),
     ] = False,
+    hdf5: Annotated[bool, typer.Option("--hdf5", help="HDF5 in the layout of NeXus.")] = False,
+    uff: Annotated[
+        bool, typer.Option("--uff", help="UFF 58: histories and frequency responses.")
+    ] = False,
+    crate: Annotated[
+        bool, typer.Option("--crate", help="Also describe the new files as an RO-Crate.")
+    ] = False,
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", help="New file without ending; default: next to LOG."),
@@ -150,6 +157,9 @@ def export_command(
     """Export measurement and twin of a log for other tools, in several formats at once."""
     from twin.exchange.command import run_export
 
-    requested = {"csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd}
+    requested = {
+        "csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd,
+        "hdf5": hdf5, "uff": uff,
+    }  # fmt: skip
     formats = [kind for kind, wanted in requested.items() if wanted]
-    run_export(log, formats, out, channel or [], steps)
+    run_export(log, formats, out, channel or [], steps, crate)

@@ -85,11 +85,16 @@ def list_contents(files: Sequence[Path], out: Path | None, options: ImportOption
 
 
 def run_export(
-    log: Path, formats: Sequence[str], out: Path | None, channels: Sequence[str], steps: str | None
+    log: Path,
+    formats: Sequence[str],
+    out: Path | None,
+    channels: Sequence[str],
+    steps: str | None,
+    has_crate: bool,
 ) -> None:
     """Export a log and print the new files."""
     span = None if steps is None else parse_step_range(steps)
-    options = ExportOptions(log, tuple(formats), out, tuple(channels), span)
+    options = ExportOptions(log, tuple(formats), out, tuple(channels), span, has_crate)
     exported = export_log(options)
     if not exported.is_intact:
         warning = (

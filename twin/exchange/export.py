@@ -1,6 +1,6 @@
 """Task `export`: conversion of a log to files of other tools."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -11,7 +11,9 @@ from typing import Any
 from table_io.errors import InputError, require_package
 from table_io.formats.text import write_csv
 from table_io.records import RunStart
+from twin.exchange.crate import CRATE_FILE, write_crate
 from twin.exchange.foxglove import build_layout, write_foxglove
+from twin.exchange.uff58 import write_uff58
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
 from twin.results.recordings import open_recording
@@ -24,7 +26,10 @@ SUFFIXES = {
     "mat": ".mat",
     "foxglove": ".foxglove.mcap",
     "rrd": ".rrd",
+    "hdf5": ".h5",
+    "uff": ".uff",
 }
+EXTRA_PACKAGES = {"parquet": "pyarrow", "hdf5": "h5py"}
 LAYOUT_SUFFIX = ".layout.json"
 
 
@@ -41,6 +46,7 @@ class ExportOptions:
     out: Path | None = None
     channels: tuple[str, ...] = ()
     steps: tuple[int, int] | None = None
+    has_crate: bool = False  # with ro-crate-metadata.json, which describes the files
 
 
 @dataclass(frozen=True)
@@ -67,19 +73,16 @@ def export_log(options: ExportOptions) -> Exported:
     base = options.out or log.with_suffix("")
     paths = {kind: _output_path(kind, base) for kind in options.formats}
     layout = _layout_path(paths["foxglove"]) if "foxglove" in paths else None
-    for new in (*paths.values(), *([layout] if layout else [])):
-        if new.exists():
-            raise InputError("exists already", where=new, remedy="nothing is ever overwritten")
+    crate = base.with_name(CRATE_FILE) if options.has_crate else None
+    # Check everything before the first file is written, so that a second attempt can succeed.
+    _require_possible(options.formats, [*paths.values(), *filter(None, (layout, crate))])
     if "rrd" in paths and (options.channels or options.steps):
         raise InputError("exports a whole run", where="--rrd", remedy="omit --channel and --steps")
-    # Check everything before the first file is written, so that a second attempt can succeed.
-    if "parquet" in paths:
-        require_package("pyarrow", "formats", "--parquet")
     needs_twin = not options.channels or any(n.startswith(TWIN_PREFIX) for n in options.channels)
     files: list[Path] = []
     with TemporaryDirectory() as scratch, ExitStack() as cleanup:
         whole = restore_log(log, Path(scratch)) if needs_twin else log
-        rows = _read_rows(whole, options) if {*paths} - {"rrd"} else None
+        rows = _read_rows(whole, options) if {*paths} - {"rrd"} or crate else None
         _make_folder(base.absolute().parent, cleanup)
         for kind, path in paths.items():
             if rows is None or kind == "rrd":
@@ -92,10 +95,23 @@ def export_log(options: ExportOptions) -> Exported:
                 _write_layout(rows, layout)
                 cleanup.callback(layout.unlink, missing_ok=True)
                 files.append(layout)
+        if crate is not None and rows is not None:
+            write_crate(rows, log, files, crate)
+            files.append(crate)
         cleanup.pop_all()  # keep the files
     if rows is None:
         return Exported((*files,))
     return Exported((*files,), rows.size, len(rows.units), rows.is_intact)
+
+
+def _require_possible(formats: Sequence[str], files: Iterable[Path]) -> None:
+    """Raise InputError if a file exists, or if the package of a format is not installed."""
+    for new in files:
+        if new.exists():
+            raise InputError("exists already", where=new, remedy="nothing is ever overwritten")
+    for kind in formats:
+        if kind in EXTRA_PACKAGES:
+            require_package(EXTRA_PACKAGES[kind], "formats", f"--{kind}")
 
 
 def _read_rows(path: Path, options: ExportOptions) -> LogTable:
@@ -130,15 +146,23 @@ def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
             from table_io.formats.parquet import write_parquet
 
             texts = {"run": start.run, "rate_hz": repr(start.rate_hz), **rows.toml_texts}
+            texts["started_at"] = start.started_at
             write_parquet(rows.units, rows.iter_windows(), texts, file)
         elif kind == "mat":
             from table_io.formats.mat import write_mat
 
             facts: dict[str, str | float] = {**rows.toml_texts, "run": start.run}
+            facts["started_at"] = start.started_at
             facts["rate_hz"] = start.rate_hz
             # one by one, to limit memory
             columns = (rows.read_columns(slice(None), name) for name in rows.units)
             write_mat(rows.units, columns, facts, file)
+        elif kind == "hdf5":
+            from twin.exchange.nexus import write_hdf5  # imports h5py
+
+            write_hdf5(rows, path)
+        elif kind == "uff":
+            write_uff58(rows, path)
         else:
             write_foxglove(rows, file)
 

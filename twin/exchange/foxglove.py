@@ -2,12 +2,13 @@
 
 Foxglove plots one value per message time, so blocks are split: messages on `/measured` and `/twin`
 hold one sample, on `/prc` a point of the pseudo-resonance curves, on `/events` a foxglove.Log. All
-are protobuf with embedded schemas; the time of a message is that of its sample, from 0.
+are protobuf with embedded schemas; the time of a message is that of its sample, absolute by the
+start of the run.
 """
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from heapq import merge
 from operator import itemgetter
 from typing import Any, BinaryIO
@@ -51,6 +52,19 @@ PRC_COLUMNS = [
 ]
 WIRE_8, WIRE_BYTES, WIRE_4 = 1, 2, 5  # protobuf wire types
 LINE_COLOURS = ("#e8e8e8", "#f5a623", "#4a90e2")  # measured, restarted twin, free-running twin
+
+
+@dataclass(frozen=True, slots=True)
+class SampleClock:
+    """Time of each sample, by the start of the run in ns since 1970 and the sampling rate."""
+
+    started_ns: int
+    rate_hz: float
+
+    def find_ns(self, index: int) -> int:
+        return self.started_ns + round(index * 1e9 / self.rate_hz)
+
+
 FoxgloveMessage = tuple[str, int, bytes]  # topic, sample index, payload
 
 
@@ -66,7 +80,7 @@ def write_foxglove(rows: LogTable, file: BinaryIO) -> None:
         topic: topic_fields for topic, topic_fields in fields_by_topic.items() if topic_fields
     }
     curves = [(name, "double") for name in PRC_COLUMNS]
-    rate = rows.start.rate_hz
+    clock = SampleClock(rows.started_ns, rows.start.rate_hz)
     with open_foreign_log(file) as writer:
         ids = {}
         for topic, message_fields in {
@@ -80,22 +94,24 @@ def write_foxglove(rows: LogTable, file: BinaryIO) -> None:
             schema = build_flat_schema(name, [("timestamp", "time"), *message_fields])
             schema_id = writer.register_schema(name, "protobuf", schema)
             ids[topic] = writer.register_channel(topic, "protobuf", schema_id)
-        messages = (_to_message(record, rate) for record in rows.records)
+        messages = (_to_message(record, clock) for record in rows.records)
         for topic, index, payload in merge(
-            messages, _iter_samples(rows, fields_by_topic), key=itemgetter(1)
+            messages, _iter_samples(rows, clock, fields_by_topic), key=itemgetter(1)
         ):
-            time_ns = round(index * 1e9 / rate)
+            time_ns = clock.find_ns(index)
             writer.add_message(ids[topic], log_time=time_ns, data=payload, publish_time=time_ns)
 
 
-def _iter_samples(rows: LogTable, fields_by_topic: dict[str, Fields]) -> Iterator[FoxgloveMessage]:
+def _iter_samples(
+    rows: LogTable, clock: SampleClock, fields_by_topic: dict[str, Fields]
+) -> Iterator[FoxgloveMessage]:
     """Yield one message per sample and topic."""
     first = 0
     for window in rows.iter_windows():
         index = rows.sample_index(slice(first, first + WINDOW_ROWS))
         first += index.size
         payloads_by_topic = {
-            topic: _pack_rows(index, rows.start.rate_hz, window, topic_fields)
+            topic: _pack_rows(index, clock, window, topic_fields)
             for topic, topic_fields in fields_by_topic.items()
         }
         for k, sample in enumerate(index.tolist()):
@@ -103,29 +119,31 @@ def _iter_samples(rows: LogTable, fields_by_topic: dict[str, Fields]) -> Iterato
                 yield topic, sample, payloads[k]
 
 
-def _pack_rows(index: Int1D, rate_hz: float, columns: Columns, topic_fields: Fields) -> list[bytes]:
+def _pack_rows(
+    index: Int1D, clock: SampleClock, columns: Columns, topic_fields: Fields
+) -> list[bytes]:
     """Encode one message per row, vectorized.
 
     Every field has a fixed width after its tag, so that all rows form one structured array.
     """
-    tags, parts = {}, [("timestamp", f"S{len(_encode_timestamp(0, 1.0))}")]
+    tags, parts = {}, [("timestamp", f"S{len(_encode_timestamp(0))}")]
     for number, (name, kind) in enumerate(topic_fields, start=2):
         tags[name] = _encode_varint(number << 3 | (WIRE_8 if kind == "double" else WIRE_4))
         value = "<f8" if kind == "double" else "<i4"
         parts += [(f"tag {name}", f"S{len(tags[name])}"), (name, value)]
     table = np.zeros(index.size, parts)
-    table["timestamp"] = [_encode_timestamp(sample, rate_hz) for sample in index.tolist()]
+    table["timestamp"] = [_encode_timestamp(clock.find_ns(sample)) for sample in index.tolist()]
     for name, tag in tags.items():
         table[f"tag {name}"], table[name] = tag, columns[name]
     data, width = table.tobytes(), table.itemsize
     return [data[k : k + width] for k in range(0, len(data), width)]
 
 
-def _to_message(record: Record, rate_hz: float) -> FoxgloveMessage:
+def _to_message(record: Record, clock: SampleClock) -> FoxgloveMessage:
     """Encode an event as foxglove.Log, or a PRC point."""
-    timestamp = _encode_timestamp(record.index, rate_hz)
+    timestamp = _encode_timestamp(clock.find_ns(record.index))
     if isinstance(record, Event):
-        text = format_record(record, rate_hz)
+        text = format_record(record, clock.rate_hz)
         level = LEVEL_WARNING if text and text[0] != "INFO" else LEVEL_INFO
         payload = timestamp + _encode_varint(2 << 3) + _encode_varint(level)
         return (
@@ -146,13 +164,13 @@ def _to_message(record: Record, rate_hz: float) -> FoxgloveMessage:
     return (
         CURVES_TOPIC,
         record.index,
-        _pack_rows(np.array([record.index]), rate_hz, columns, topic_fields)[0],
+        _pack_rows(np.array([record.index]), clock, columns, topic_fields)[0],
     )
 
 
-def _encode_timestamp(index: int, rate_hz: float) -> bytes:
-    """Encode the time of sample `index` as field 1, a Timestamp of fixed width."""
-    seconds, nanos = divmod(round(index * 1e9 / rate_hz), 10**9)
+def _encode_timestamp(time_ns: int) -> bytes:
+    """Encode a time as field 1, a Timestamp of fixed width."""
+    seconds, nanos = divmod(time_ns, 10**9)
     inner = b"\x08" + _encode_varint(seconds, 5) + b"\x10" + _encode_varint(nanos, 5)
     return _encode_varint(1 << 3 | WIRE_BYTES) + _encode_varint(len(inner)) + inner
 

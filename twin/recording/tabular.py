@@ -9,6 +9,7 @@ twin columns are NaN where the twin has no output. Invalid items are left out by
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -106,6 +107,15 @@ class LogTable:
         """TOML texts of profile, rig and model, with which the run can be repeated."""
         names = ("profile_toml", "rig_toml", "model_toml")
         return {name: getattr(self.start, name) for name in names}
+
+    @property
+    def started_ns(self) -> int:
+        """Start of the run in ns since 1970, 0 if it is not stated; local time without a zone."""
+        try:
+            start = datetime.fromisoformat(self.start.started_at)
+            return max(0, round(start.timestamp() * 1e9))
+        except (ValueError, OverflowError):
+            return 0
 
     def iter_windows(self) -> Iterator[Columns]:
         """Yield all columns in consecutive windows of WINDOW_ROWS rows."""

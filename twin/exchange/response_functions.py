@@ -1,0 +1,67 @@
+"""Frequency responses of a stepped sine: each channel over the acceleration of the table, by step.
+
+The fundamentals are those of order tracking over the measured cycles of a step. A specimen with
+contacts is not linear: the ratio holds at the level and in the direction of its sweep.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from table_io.block import Float1D, Label
+from table_io.channels import TIME_COLUMN
+from table_io.control.order_tracking import Complex1D, track_harmonics
+from twin.recording.tabular import DIRECTION_SIGNS, LABEL_UNITS, TWIN_PREFIX, LogTable
+
+REFERENCE = "table_acc_m_s2"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepResponse:
+    """Complex ratio of each channel to the table's acceleration, (step,), of one direction."""
+
+    direction: str
+    frequency_hz: Float1D
+    ratios: dict[str, Complex1D]
+
+
+def compute_sweep_responses(rows: LogTable) -> list[SweepResponse]:
+    """Return the responses of the directions of a log; [] without steps or table acceleration."""
+    if REFERENCE not in rows.units:
+        return []
+    channels = [
+        name
+        for name in rows.units
+        if name not in (TIME_COLUMN, *LABEL_UNITS) and not name.startswith(TWIN_PREFIX)
+    ]
+    step, label, time_s = (
+        rows.read_columns(slice(None), name)[name] for name in ("step", "label", TIME_COLUMN)
+    )
+    values = np.array([rows.read_columns(slice(None), name)[name] for name in channels])
+    is_measured = label == int(Label.MEASURE)
+    responses = []
+    for direction in DIRECTION_SIGNS:
+        steps = [
+            entry
+            for entry in rows.steps.values()
+            if entry.direction == direction and (is_measured & (step == entry.index)).any()
+        ]
+        if not steps:
+            continue
+        ratios = np.empty((len(channels), len(steps)), dtype=np.complex128)
+        for k, entry in enumerate(steps):
+            samples = np.flatnonzero(is_measured & (step == entry.index))
+            phase = entry.frequency_hz * time_s[samples]
+            fundamentals = np.array([_fit_fundamental(row[samples], phase) for row in values])
+            ratios[:, k] = fundamentals / fundamentals[channels.index(REFERENCE)]
+        order = np.argsort([entry.frequency_hz for entry in steps], kind="stable")
+        frequency_hz = np.array([steps[k].frequency_hz for k in order])
+        named = dict(zip(channels, ratios[:, order], strict=True))
+        responses.append(SweepResponse(direction, frequency_hz, named))
+    return responses
+
+
+def _fit_fundamental(values: Float1D, phase: Float1D) -> complex:
+    """Return the fundamental of the samples that are known; NaN if they are too few."""
+    known = np.isfinite(values)
+    return complex(track_harmonics(values[known], phase[known]).amplitudes[0])
