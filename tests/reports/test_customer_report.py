@@ -4,8 +4,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.builders.rigs import make_faulty_rig
-from tests.builders.sessions import play_session
 from tests.command_line import call_main
 from tests.setup.test_swept_prediction import PROFILE
 from twin.inspection.folder_report import write_folder_report
@@ -57,13 +55,3 @@ def test_customer_report_is_a_page_and_a_pdf(folder: Path) -> None:
     assert pdf.startswith(b"%PDF")
     assert pdf.rstrip().endswith(b"%%EOF")
     assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") >= 2
-
-
-def test_a_clean_test_has_no_deviations() -> None:
-    # A table that follows its sweep reports nothing: alarms would name a sensor that is sound.
-    from tests.table_io.acquisition.test_swept_sine import make_swept_profile
-
-    played = play_session(make_swept_profile(stop_hz=2.2), rig=make_faulty_rig(), joins_blocks=True)
-    assert played.stop.verdict == "complete"
-    assert not played.select_events("alarm")
-    assert not played.select_events("sensor")

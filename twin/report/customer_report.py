@@ -30,7 +30,6 @@ from twin.system.files import hash_file
 
 CUSTOMER_FIGURES = ("swept_sine", "table_spectrum", "table_acceleration", "level", "prc")
 MAX_ALARMS = 10
-MAX_CELL = 46  # characters of a cell in the PDF before it is wrapped
 PAGE_IN, MARGIN, LINE = (8.27, 11.69), 0.09, 0.0155  # A4; shares of the page
 FIGURE_DPI = 200
 Rows = Sequence[tuple[str, ...]]

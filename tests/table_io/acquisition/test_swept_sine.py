@@ -15,7 +15,13 @@ from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import Event, SweepLevel, Trip
 from tests.builders.profiles import make_history_profile
-from tests.builders.rigs import make_faulty_rig, read_rig
+from tests.builders.rigs import (
+    SECOND_ACC,
+    TEMPERATURE,
+    make_faulty_rig,
+    make_lab_rig,
+    read_rig,
+)
 from tests.builders.sessions import PlayedSession, play_session
 
 GRAVITY_M_S2 = 9.80665
@@ -122,6 +128,13 @@ def test_blocks_change_no_sample_of_a_sweep(swept: PlayedSession) -> None:
     assert swept.select(SweepLevel) == other.select(SweepLevel)
 
 
+def test_sound_sweep_raises_no_alarm(swept: PlayedSession) -> None:
+    assert swept.stop.verdict == "complete"
+    kinds = {event.kind for event in swept.select(Event)}
+    assert not kinds & {"alarm", "sensor", "late", "level"}
+    assert not swept.select(Trip)
+
+
 def test_displacement_below_the_crossover() -> None:
     profile = make_swept_profile(acceleration_g=0.1, displacement_mm=3.0)
     played = play_session(profile, joins_blocks=True)
@@ -212,6 +225,21 @@ def test_limit_warns_once_an_episode_and_goes_on() -> None:
     assert len(alarms) == 1
     assert "exceeds the limit of the test" in alarms[0].text
     assert played.stop.verdict == "complete"
+
+
+def test_limit_of_a_channel_of_the_laboratory_stops_and_notches() -> None:
+    rig = make_lab_rig()
+    warm = {"channel": TEMPERATURE, "limit": 20.0}
+    played = play_session(make_swept_profile({"limits": [warm]}), rig=rig)
+    assert played.stop.verdict == "aborted"
+    assert TEMPERATURE in played.stop.reason
+    assert np.abs(played.command_m).max() < 2e-6  # it is too warm before anything moves
+    notch = {"channel": SECOND_ACC, "limit": 0.09, "unit": "g", "action": "notch"}
+    profile = make_swept_profile({"limits": [notch]}, stop_hz=2.5, octaves_per_min=2.0)
+    played = play_session(profile, rig=rig, joins_blocks=True)
+    hz, second, _ = measure_cycles(played, SECOND_ACC)
+    assert (second[hz > 1.55] / (0.09 * GRAVITY_M_S2)).max() < 1.03
+    assert SECOND_ACC in {entry.limited_by for entry in played.select(SweepLevel)}
 
 
 FAULTS = {

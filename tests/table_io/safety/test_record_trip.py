@@ -10,6 +10,7 @@ from table_io.config.excitation.drive_file import format_drive
 from table_io.config.profile import load_profile
 from table_io.config.provenance import Provenance
 from table_io.records import Trip
+from tests.builders.rigs import change_rig
 from tests.builders.sessions import play_session
 
 RECORD = """
@@ -32,10 +33,14 @@ drive = "drive.csv"
 """
 
 
-@pytest.mark.parametrize(("factor", "trips"), [(1.0, False), (1.83, True)])
+@pytest.mark.parametrize(
+    ("factor", "least_level_g", "trips"),
+    [(1.0, 0.0, False), (1.83, 0.0, True), (1.83, 0.02, True), (1.83, 0.4, False)],
+)
 def test_a_table_far_off_the_target_of_its_drive_trips(
-    tmp_path: Path, factor: float, trips: bool
+    tmp_path: Path, factor: float, least_level_g: float, trips: bool
 ) -> None:
+    # Half of the least level is friction, which adds to the acceleration of any target.
     path = tmp_path / "record.toml"
     path.write_text(RECORD.replace('drive = "drive.csv"\n', ""))
     excitation = load_profile(path)[0].excitation
@@ -44,7 +49,8 @@ def test_a_table_far_off_the_target_of_its_drive_trips(
     drive = format_drive(factor * target, target, "drive", Provenance())
     (tmp_path / "drive.csv").write_text(drive)
     path.write_text(RECORD)
-    session = play_session(load_profile(path)[0])
+    rig = change_rig(table_response={"least_level_g": least_level_g})
+    session = play_session(load_profile(path)[0], rig=rig)
     trip_records = session.select(Trip)
     assert bool(trip_records) is trips
     if trips:
