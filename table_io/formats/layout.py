@@ -115,12 +115,12 @@ def _find_numbers(
 def _find_samples(kinds: Sequence[str], filled: Sequence[int]) -> int | None:
     """Return the first row with numbers, or times, and text in the same places as those below."""
     for place, index in enumerate(filled[:-1]):
-        below = filled[place + 1 :]
-        alike = [_is_alike(kinds[index], kinds[k]) for k in below]
+        kind, below = kinds[index], [kinds[k] for k in filled[place + 1 :]]
+        # All rows below are compared only where the first two are alike: a table may be long.
         if (
-            {"n", "c"} & {*kinds[index]}
-            and all(alike[:2])
-            and sum(alike) >= MIN_ALIKE_SHARE * len(below)
+            {"n", "c"} & {*kind}
+            and all(_is_alike(kind, other) for other in below[:2])
+            and sum(_is_alike(kind, other) for other in below) >= MIN_ALIKE_SHARE * len(below)
         ):
             return index
     return None

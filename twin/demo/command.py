@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from table_io.clock import RealClock
 from table_io.config.base import PROFILES_DIR
 from table_io.sim.ground_truth import (
@@ -24,10 +22,10 @@ from table_io.sim.ground_truth import (
 )
 from twin.discovery.command import run_discovery
 from twin.discovery.result import Verdict
-from twin.drawing.page import embed_images, render_page
-from twin.drawing.panels import CaptionedFigure, CaptionedFigures
-from twin.drawing.pictures import direction_handles, save_figures
-from twin.drawing.plot_style import LineStyle, measured_style, twin_style
+from twin.drawing.charts import make_chart_script
+from twin.drawing.page import render_page
+from twin.drawing.panels import CaptionedFigure, PanelFigure
+from twin.drawing.plot_style import LineStyle, direction_keys, measured_style, twin_style
 from twin.drawing.prc_drawing import break_at_jumps, plot_prc
 from twin.laws.library import find_effect
 from twin.live.run_command import run_test
@@ -239,11 +237,12 @@ def keep_rig(folder: Path, hidden: HiddenEffect, seed: int) -> Path:
 
 def write_demo_page(folder: Path, story: Story, before: TwinError, after: TwinError) -> Path:
     """Write folder/report.html, the story with its figure and links; return the path."""
-    pictures = save_figures(_draw_runs(before, after), folder / "figures")
+    figure = _draw_runs(before, after)
     page = render_page(
         Path(__file__).with_name("demo.html"),
         chapters=story.chapters,
-        images=embed_images(pictures),
+        figure=figure,
+        script=make_chart_script([figure]),
         before=before,
         after=after,
         links={
@@ -258,12 +257,11 @@ def write_demo_page(folder: Path, story: Story, before: TwinError, after: TwinEr
     return path
 
 
-def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
-    """Yield the figure of excursions of rig and twin over frequency, first and second run."""
-    figure = Figure(figsize=(10.0, 3.8))
+def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigure:
+    """Return the figure of excursions of rig and twin over frequency, first and second run."""
     runs = {"first run, model as it was": before, "second run, effect added": after}
-    panels = figure.subplots(1, len(runs), sharex=True, sharey=True)
-    for panel, (title, run) in zip(panels, runs.items(), strict=True):
+    figure = PanelFigure((10.0, 3.8), 1, len(runs), sharey="row")
+    for panel, (title, run) in zip(figure.panels[0], runs.items(), strict=True):
         for source, jumps, make_style in (
             ("measured", run.summary.jumps, _rig_style),
             ("twin", run.summary.twin_jumps, _twin_style),
@@ -272,11 +270,10 @@ def _draw_runs(before: TwinError, after: TwinError) -> CaptionedFigures:
             plot_prc([(panel, {"eta_d": 1})], curves, make_style)
         panel.set_title(f"{title}: twin error {100 * run.error:.2g} %")
         panel.set_xlabel("frequency of the table in Hz")
-    panels[0].set_ylabel("excursion of the mass, normalized")
-    panels[0].legend(
-        handles=[*direction_handles(_rig_style, "rig, "), *direction_handles(_twin_style, "twin, ")]
-    )
-    yield CaptionedFigure(
+    figure.panels[0, 0].set_ylabel("excursion of the mass, normalized")
+    keys = [*direction_keys(_rig_style, "rig, "), *direction_keys(_twin_style, "twin, ")]
+    figure.legend(keys, columns=4)
+    return CaptionedFigure(
         "runs", "Rig and twin over frequency, before and after",
         "Excursion of the mass at each frequency of the sweep, up (forward) and down (backward), "
         "broken where it jumps. Wide and pale: measured; thin: the twin.", figure,

@@ -4,12 +4,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
-from twin.drawing.page import embed_images, render_page
-from twin.drawing.panels import CaptionedFigure, CaptionedFigures
-from twin.drawing.pictures import save_figures
+from twin.drawing.charts import make_chart_script
+from twin.drawing.page import render_page
+from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Key, PanelFigure
 from twin.drawing.plot_style import DIRECTION_DASHES, FIGURE_WIDTH_IN, LineStyle
 from twin.drawing.prc_drawing import (
     FREE_PANELS,
@@ -29,14 +27,15 @@ RUN_COLOURS = ("#c8741a", "#0f7b7b")  # first, second: neither is that of a dire
 def write_comparison_page(
     folder: Path, first: ComparedRun, second: ComparedRun, comparison: RunComparison
 ) -> Path:
-    """Write compare.html and its figures into a folder; return the path of the page."""
-    pictures = save_figures(draw_comparison(first, second), folder / "figures")
+    """Write compare.html into a folder; return the path of the page."""
+    figures = list(draw_comparison(first, second))
     page = folder / "compare.html"
     page.write_text(
         render_page(
             Path(__file__).with_name("run_comparison.html"),
             comparison=comparison,
-            images=embed_images(pictures),
+            figures=figures,
+            script=make_chart_script(figures),
             quantity=format_quantity,
             symbols=CHANNEL_SYMBOLS,
         ),
@@ -57,22 +56,19 @@ def draw_comparison(first: ComparedRun, second: ComparedRun) -> CaptionedFigures
         for direction in DIRECTIONS
     )
     contents = PRC_PANELS if has_bumpers else FREE_PANELS
-    figure = Figure(figsize=(FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3))
-    axes = figure.subplots(len(contents) // 2, 2, sharex=True, squeeze=False)
-    panels = make_prc_panels(axes, contents)
-    handles = []
+    figure = PanelFigure((FIGURE_WIDTH_IN, 3.6 * len(contents) / 2 + 0.3), len(contents) // 2, 2)
+    panels = make_prc_panels(figure.panels, contents)
+    keys = []
     named_runs = zip((first, second), points, RUN_COLOURS, ("first", "second"), strict=True)
     for run, of_run, colour, name in named_runs:
         for source, jumps in (("measured", run.summary.jumps), ("twin", run.summary.twin_jumps)):
             curves = break_at_jumps(partial(extract_prc, of_run, source), jumps)
             plot_prc(panels, curves, partial(_run_style, colour, source))
-            handles.append(
-                Line2D([], [], **_run_style(colour, source, "forward"), label=f"{name}, {source}")
-            )
+            keys.append(Key(f"{name}, {source}", _run_style(colour, source, "forward")))
     for direction in DIRECTIONS:
         style = {"color": "#555555", "lw": 1.0, "ls": DIRECTION_DASHES[direction]}
-        handles.append(Line2D([], [], **style, label=direction))
-    figure.legend(handles=handles, loc="outside upper center", ncols=6)
+        keys.append(Key(direction, style))
+    figure.legend(keys, columns=6)
     caption = (
         "One point per frequency step. Measured wide and pale, twin thin; solid forward, dashed "
         "backward; broken where it jumps. Each run is divided by its own u* and a*."

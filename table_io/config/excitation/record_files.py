@@ -8,6 +8,7 @@ formats, with every digit.
 import csv
 import io
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path, PurePath
 from tempfile import TemporaryDirectory
 from typing import Literal, get_args
@@ -60,6 +61,7 @@ class RecordedSeries:
     quantity: Quantity
 
 
+@lru_cache(maxsize=16)  # a campaign plays few records, each at many gaps
 def read_series(text: str, name: str, request: SeriesRequest) -> RecordedSeries:
     """Read one history of a file from its text.
 
@@ -88,7 +90,9 @@ def read_series(text: str, name: str, request: SeriesRequest) -> RecordedSeries:
             remedy="correct quantity or unit",
         )
     rate_hz = _find_rate(table, column, name, request, time_name)
-    return RecordedSeries(factor * values, rate_hz, quantity)
+    scaled = factor * values
+    scaled.flags.writeable = False  # shared by all who read the file
+    return RecordedSeries(scaled, rate_hz, quantity)
 
 
 def _find_times(table: ForeignTable, request: SeriesRequest) -> str:
