@@ -7,6 +7,7 @@ import typer
 
 from twin.options import (
     LogArgument,
+    ModelOption,
     ProfileArgument,
     StepsOption,
     TableOption,
@@ -141,6 +142,10 @@ def export_command(
     uff: Annotated[
         bool, typer.Option("--uff", help="UFF 58: histories and frequency responses.")
     ] = False,
+    fmu: Annotated[
+        bool, typer.Option("--fmu", help="The model as an FMI 3.0 co-simulation unit.")
+    ] = False,
+    model: ModelOption = None,
     crate: Annotated[
         bool, typer.Option("--crate", help="Also describe the new files as an RO-Crate.")
     ] = False,
@@ -159,7 +164,7 @@ def export_command(
 
     requested = {
         "csv": csv, "parquet": parquet, "mat": mat, "foxglove": foxglove, "rrd": rrd,
-        "hdf5": hdf5, "uff": uff,
+        "hdf5": hdf5, "uff": uff, "fmu": fmu,
     }  # fmt: skip
     formats = [kind for kind, wanted in requested.items() if wanted]
-    run_export(log, formats, out, channel or [], steps, crate)
+    run_export(log, formats, out, channel or [], steps, crate, model)

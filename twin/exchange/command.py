@@ -91,10 +91,11 @@ def run_export(
     channels: Sequence[str],
     steps: str | None,
     has_crate: bool,
+    model: str | None,
 ) -> None:
     """Export a log and print the new files."""
     span = None if steps is None else parse_step_range(steps)
-    options = ExportOptions(log, tuple(formats), out, tuple(channels), span, has_crate)
+    options = ExportOptions(log, tuple(formats), out, tuple(channels), span, has_crate, model)
     exported = export_log(options)
     if not exported.is_intact:
         warning = (
@@ -103,7 +104,7 @@ def run_export(
         )
         error_console.print(warning, highlight=False, soft_wrap=True)
     for path in exported.files:
-        has_rows = path.suffix not in (".rrd", ".json")
+        has_rows = path.suffix not in (".rrd", ".json", ".fmu")
         size = f"{exported.rows} rows of {exported.columns} columns -> " if has_rows else ""
         print_line(f"{size}{path}")
 

@@ -12,6 +12,7 @@ from table_io.errors import InputError, require_package
 from table_io.formats.text import write_csv
 from table_io.records import RunStart
 from twin.exchange.crate import CRATE_FILE, write_crate
+from twin.exchange.fmu import write_fmu
 from twin.exchange.foxglove import build_layout, write_foxglove
 from twin.exchange.uff58 import write_uff58
 from twin.recording.run_paths import resolve_log_path
@@ -28,7 +29,9 @@ SUFFIXES = {
     "rrd": ".rrd",
     "hdf5": ".h5",
     "uff": ".uff",
+    "fmu": ".fmu",
 }
+WHOLE_FORMATS = ("rrd", "fmu")  # which take no choice of channels and steps
 EXTRA_PACKAGES = {"parquet": "pyarrow", "hdf5": "h5py"}
 LAYOUT_SUFFIX = ".layout.json"
 
@@ -47,6 +50,7 @@ class ExportOptions:
     channels: tuple[str, ...] = ()
     steps: tuple[int, int] | None = None
     has_crate: bool = False  # with ro-crate-metadata.json, which describes the files
+    model: str | None = None  # of an FMU, instead of the recorded one
 
 
 @dataclass(frozen=True)
@@ -76,16 +80,20 @@ def export_log(options: ExportOptions) -> Exported:
     crate = base.with_name(CRATE_FILE) if options.has_crate else None
     # Check everything before the first file is written, so that a second attempt can succeed.
     _require_possible(options.formats, [*paths.values(), *filter(None, (layout, crate))])
-    if "rrd" in paths and (options.channels or options.steps):
-        raise InputError("exports a whole run", where="--rrd", remedy="omit --channel and --steps")
+    for kind in {*paths} & {*WHOLE_FORMATS} if options.channels or options.steps else ():
+        raise InputError(
+            "exports a whole run", where=f"--{kind}", remedy="omit --channel and --steps"
+        )
     needs_twin = not options.channels or any(n.startswith(TWIN_PREFIX) for n in options.channels)
     files: list[Path] = []
     with TemporaryDirectory() as scratch, ExitStack() as cleanup:
         whole = restore_log(log, Path(scratch)) if needs_twin else log
-        rows = _read_rows(whole, options) if {*paths} - {"rrd"} or crate else None
+        rows = _read_rows(whole, options) if {*paths} - {*WHOLE_FORMATS} or crate else None
         _make_folder(base.absolute().parent, cleanup)
         for kind, path in paths.items():
-            if rows is None or kind == "rrd":
+            if kind == "fmu":
+                write_fmu(log, options.model, path)
+            elif rows is None or kind == "rrd":
                 _write_rrd(whole, path)
             else:
                 _write_rows(kind, rows, path)
