@@ -34,7 +34,8 @@ def write_folder_report(
     if (folder / PARTS_FOLDER).is_dir():
         merge_run_parts(folder)
     if as_pdf or all_formats or for_customer:
-        _require_run(folder, "--figures" if all_formats else "--format")
+        kind = "pdf" if as_pdf else "customer"
+        _require_run(folder, f"--format {kind}" if as_pdf or for_customer else "--figures")
     # What draws pictures is slow to import: the report of a run waits for none of it.
     if (folder / STATE_FILE).is_file():
         from twin.campaign.report import write_campaign_report
