@@ -21,6 +21,7 @@ from twin.results.sealed_lines import SealedLines
 from twin.system.grid import Watch
 from twin.system.process_pool import TaskResult, Workers
 
+LOGS_TO_KILL = 150
 Stop = Callable[[], object]
 
 
@@ -167,8 +168,8 @@ def test_command_states_failures_by_its_exit_code(archive: Path, tmp_path: Path)
 
 @pytest.mark.usefixtures("here")
 def test_nothing_is_lost_or_doubled_by_twenty_kills(tmp_path: Path) -> None:
-    for number in range(60):
-        folder = tmp_path / "archive" / f"run{number:02d}"
+    for number in range(LOGS_TO_KILL):
+        folder = tmp_path / "archive" / f"run{number:03d}"
         folder.mkdir(parents=True)
         write_run(folder, number % 4)
     out, places = tmp_path / "out", [tmp_path / "archive"]
@@ -176,12 +177,17 @@ def test_nothing_is_lost_or_doubled_by_twenty_kills(tmp_path: Path) -> None:
     options = FleetOptions("verify", places, out=out, resume=True)
     dice = random.Random(11)
     kept = 0
-    for _ in range(20):
+    for kill in range(20):
         child = os.fork()
         if child == 0:
             run_fleet(options)
             os._exit(0)
-        time.sleep(dice.uniform(0.005, 0.05))
+        deadline_s = time.monotonic() + 20.0
+        path = out / "results.jsonl"
+        while kill % 2 and path.read_bytes().count(b"\n") <= kept:
+            assert time.monotonic() < deadline_s, "the fleet does not go on"
+            time.sleep(0.001)
+        time.sleep(dice.uniform(0.0, 0.01))
         os.kill(child, signal.SIGKILL)
         assert os.WIFSIGNALED(os.waitpid(child, 0)[1]), "it was complete before it was killed"
         lines = [*SealedLines(out / "results.jsonl", FleetLine).read()]
@@ -189,6 +195,6 @@ def test_nothing_is_lost_or_doubled_by_twenty_kills(tmp_path: Path) -> None:
         assert len(lines) >= kept, "a result is lost"
         kept = len(lines)
     results = run_fleet(options).results
-    assert [line.number for line in results] == list(range(60))
+    assert [line.number for line in results] == list(range(LOGS_TO_KILL))
     assert [row["log"] for row in read_table(out / "table.csv")] == [line.log for line in results]
-    assert 1 < kept < 60
+    assert 10 < kept < LOGS_TO_KILL

@@ -23,6 +23,7 @@ from twin.results.contract import Contract
 from twin.results.sealed_lines import SealedLine, SealedLines
 from twin.setup.folders import claim_folder, find_sharing_problem, make_run_folder
 from twin.setup.run_config import read_model_template
+from twin.system.files import replace_text
 from twin.system.grid import MAX_ATTEMPTS, Watch
 from twin.system.process_pool import Workers, run_tasks
 from twin.system.versions import find_version_problem, read_installed_versions
@@ -203,7 +204,7 @@ def _open_fleet(options: FleetOptions) -> tuple[Path, FleetDefinition]:
     else:
         folder, _ = make_run_folder(options.out, f"{options.task}-fleet")
     definition = FleetDefinition(task=options.task, model=model, logs=logs, versions=versions)
-    definition.write(folder / DEFINITION_FILE)
+    replace_text(folder / DEFINITION_FILE, definition.to_json() + "\n")
     return folder, definition
 
 
