@@ -326,7 +326,7 @@ def _foresee_ratio(
     jumps = [abs(predict(ln_f) - predict(at)) for at, _ in points]
     if not all(jump < MAX_FORESEEN_CHANGE for jump in jumps):
         return math.nan
-    return extrapolate_ratio(points[-1:], predict, ln_f)  # the twin gives the slope
+    return extrapolate_ratio(points, predict, ln_f)
 
 
 def _choose_correction(
