@@ -18,6 +18,7 @@ import llvmlite
 import numba
 from numba import njit, types
 from numba.core.compiler import CompileResult
+from numba.core.runtime.nrt import rtsys
 from numba.core.serialize import dumps
 from numba.extending import overload, register_jitable
 
@@ -209,7 +210,7 @@ class _KernelCache:
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled function for a signature, None if it has to be compiled."""
-        target_context.refresh()
+        rtsys.initialize(target_context)  # all else is for compilation, which loads it
         path = self._locate(signature, target_context.codegen())
         try:
             content = path.read_bytes()
