@@ -22,9 +22,8 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Chebyshev
-from scipy.ndimage import uniform_filter1d
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from twin.compare.spectra import Spectrum
 from twin.discovery.least_squares import FitResult, MapFunction
@@ -38,7 +37,7 @@ from twin.discovery.parameters import (
     size_of_unit,
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
-from twin.discovery.signals import SENSOR_PAIRS, LogSignals, weigh_sensors
+from twin.discovery.signals import SENSOR_PAIRS, LogSignals, pass_motion, weigh_sensors
 from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
@@ -65,7 +64,6 @@ TYPICAL_PLATE = 0.005  # of the specimen's mass
 TYPICAL_CROSS = 0.01  # cross-axis sensitivity and pitch
 TYPICAL_GAP_M = 1e-4  # of the readings of the set-up
 MAX_SIZE = 4.0  # typical sizes: a larger error is a fault, or the specimen differs there
-WIENER_BAND_HZ, MIN_WIENER_LINES = 0.5, 9  # in which the power of a motion is averaged
 SLOPE_STEP = 0.1  # of a typical size, for the finite difference
 MIN_COLUMN_NORM = 1.0  # a nuisance that changes the residual by less at its typical size is dropped
 
@@ -284,11 +282,11 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     signals, m = residuals.signals, residuals.motion()
     spectra, grid = dict(signals.spectra), signals.grid
     model = parameters.model_for_log(residuals.log_number, m)
-    gain = _pass_motion(signals, m.u, signals.motion_density)
+    gain = pass_motion(signals, m.u, signals.motion_density)
     u, v = grid.apply_gain(m.u, gain), grid.apply_gain(m.v, gain)
     for laser in spectra.keys() & {*LASERS}:
         density = signals.noise[laser] / math.sqrt(grid.decimation)
-        spectra[laser] = spectra[laser] * _pass_motion(
+        spectra[laser] = spectra[laser] * pass_motion(
             signals, grid.to_time_domain(spectra[laser]), density
         )
     forces = forces_along(model, u, v, m.table_acc, m.time_s, residuals.contact_state)
@@ -323,22 +321,7 @@ def _smooth_table_acc(signals: LogSignals) -> Spectrum:
         acc = square * (laser_share * signals.spectra["table_disp_m"] + acc_share * acc)
         density = np.abs(square) * error_m
     density = density / math.sqrt(grid.decimation)
-    return acc * _pass_motion(signals, grid.to_time_domain(acc), density)
-
-
-def _pass_motion(signals: LogSignals, u: Float1D, density: Float1D) -> Float1D:
-    """Return the gain of a Wiener filter, (frequency,), of a motion u, (sample,).
-
-    `density` is that of its noise, (frequency,), at the rate of u.
-    """
-    hz = signals.omega / (2.0 * np.pi)
-    window = np.hanning(u.size)  # the step at an open end has power at all frequencies
-    spectrum = signals.grid.from_time_domain(window * u) / signals.grid.decimation
-    power = np.abs(spectrum) ** 2 / float(window @ window)
-    power = uniform_filter1d(power, max(round(WIENER_BAND_HZ / hz[1]), MIN_WIENER_LINES))
-    # noise alone exceeds its mean in a band by chance
-    noise = 2.0 * density**2
-    return np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
+    return acc * pass_motion(signals, grid.to_time_domain(acc), density)
 
 
 def sensor_mask(residuals: LogResiduals) -> Bool2D:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
+from scipy.signal import spectrogram
 
 from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
@@ -37,6 +39,8 @@ MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 # filter, or of the Nyquist frequency, up to which a channel is as it was measured.
 MIN_BAND_RATIO, BAND_OF_FILTER = 4.0, 0.7
 BAND_ROLL_OFF = 2.0  # end of the low pass of the motion over the end of that band
+WIENER_SEGMENT_S, WIENER_LINES = 4.0, 9  # in which the power of a motion is averaged
+MAX_CHANCE_POWER = 3.0  # of the loudest of some tens of such averages of noise, over its mean
 NOISE_SEED = 20_26, 0  # of the copy of the noise: the same recording gives the same verdict
 MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
 BODY_SENSORS = (
@@ -78,6 +82,7 @@ class LogSignals:
     good: Bool2D
     rest_noise: Mapping[str, RestNoise] = field(default_factory=dict)  # where there is a rest
     band_hz: float = math.inf  # highest frequency at which the measured forces exceed their noise
+    motion_pass: Float1D | float = 1.0  # gain of a Wiener filter of the displacement, (frequency,)
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
 
     @property
@@ -296,6 +301,22 @@ def weigh_sensors(
     )
 
 
+def pass_motion(signals: LogSignals, u: Float1D, density: Float1D) -> Float1D:
+    """Return the gain of a Wiener filter, (frequency,), of a motion u, (sample,).
+
+    `density` is that of its noise, (frequency,), at the rate of u. What is loud in any part of
+    the record passes: the frequency of a drive may change.
+    """
+    rate_hz = signals.grid.rate_hz / signals.grid.decimation
+    size = min(round(WIENER_SEGMENT_S * rate_hz), u.size)
+    hz, _, power = spectrogram(u, rate_hz, "hann", size, size // 2, detrend=False)
+    power = uniform_filter1d(0.5 * rate_hz * power, WIENER_LINES, axis=0).max(axis=1)
+    # noise alone exceeds its mean in a band by chance
+    power = np.interp(signals.omega / (2.0 * np.pi), hz, power) - MAX_CHANCE_POWER * density**2
+    power = np.maximum(power, 0.0)
+    return power / np.maximum(power + density**2, 1e-300)
+
+
 @dataclass(frozen=True, slots=True)
 class _ChannelWeights:
     """Share of a displacement or acceleration in the fusion, gains by frequency, (frequency,)."""
@@ -326,7 +347,8 @@ class _SensorFusion:
         else:
             accelerometers = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
             densities = [self._weigh("mass against table", 1, "rel_disp_m", accelerometers)]
-        self.density = np.hypot.reduce(densities)
+        # what passes of the noise, and what is lost of the motion
+        self.density = np.hypot.reduce(densities) * np.sqrt(signals.motion_pass)
         density = self.density * self.low_pass
         # the surface noise is too slow for the low pass
         surface = math.sqrt(len(densities)) * signals.surface_noise_m
@@ -348,20 +370,18 @@ class _SensorFusion:
 
         With a `sign` for each accelerometer: mass less table, where the laser reads their distance.
         """
-        s_x = self.noise[laser]
+        s_x, motion_pass = self.noise[laser], self.low_pass * self.signals.motion_pass
         if not accelerometers.keys() <= self.signals.spectra.keys():
-            self.weights[laser] = _ChannelWeights(sign * self.low_pass)
+            self.weights[laser] = _ChannelWeights(sign * motion_pass)
             return s_x
         s_a, w2 = np.hypot.reduce([self.noise[name] for name in accelerometers]), self.omega**2
         laser_share, acc_share, density = weigh_sensors(self.omega, s_x, s_a)
         variance = s_a**2 + w2**2 * s_x**2
         residual = self.low_pass / np.sqrt(variance) / self.kept_share
-        self.weights[laser] = _ChannelWeights(
-            sign * laser_share * self.low_pass, body, w2 * residual
-        )
+        self.weights[laser] = _ChannelWeights(sign * laser_share * motion_pass, body, w2 * residual)
         for name, own_sign in accelerometers.items():
             self.weights[name] = _ChannelWeights(
-                sign * own_sign * acc_share * self.low_pass, body, own_sign * residual
+                sign * own_sign * acc_share * motion_pass, body, own_sign * residual
             )
         self.sensitivity[body] = 1.0 / (float(np.sqrt(variance[0])) * self.kept_share)
         return density
@@ -521,7 +541,11 @@ def build_signals(
     hz = grid.omega / (2.0 * np.pi)
     roll_off = np.clip((hz / band_hz - 1.0) / (BAND_ROLL_OFF - 1.0), 0.0, 1.0)
     low_pass = grid.low_pass * (0.5 + 0.5 * np.cos(np.pi * roll_off))
-    return replace(signals, low_pass=low_pass, band_hz=band_hz)
+    signals = replace(signals, low_pass=low_pass, band_hz=band_hz)
+    if derives_acc(columns):
+        return signals
+    gain = pass_motion(signals, signals.fuse_motion().u, signals.motion_density)
+    return replace(signals, motion_pass=gain)
 
 
 def has_single_frequency(signals: LogSignals) -> bool:
