@@ -78,6 +78,7 @@ OTHER_LABS = {
     "one cell a side": Instruments(share=1.0, share_left=1.0, missing=("force_r2_n", "force_l2_n")),
     "skew": Instruments(skew_s=1e-4, filter_share=0.2),
     "14 bits": Instruments(bits=14),
+    "curved": Instruments(curve=1e-3),
     "loud": Instruments(laser=5e-5, acc=0.05, cell=5.0),
     "quiet": Instruments(laser=1e-6, acc=1e-3, cell=0.2),
     "500 Hz": Instruments(filter_share=0.35),
@@ -158,6 +159,30 @@ def draw_small_cases(seeds: range) -> Iterator[Case]:
                    truth=(effect,))  # fmt: skip
 
 
+PAIRS = (
+    ("cubic_stiffness", "coulomb_friction"),
+    ("coulomb_friction", "bumper_hardening"),
+    ("quadratic_damping", "bumper_asymmetry"),
+    ("cubic_stiffness", "hunt_crossley"),
+    ("maxwell_damper", "bumper_hardening"),
+    ("bouc_wen", "gap_drift"),
+    ("hunt_crossley", "bumper_asymmetry"),
+    ("cubic_stiffness", "table_tilt"),
+)
+
+
+def draw_pair_cases(seeds: range) -> Iterator[Case]:
+    """Two effects of the library at once, each of the size that it has alone."""
+    for seed in seeds:
+        pair = PAIRS[seed % len(PAIRS)]
+        gap = "g4" if any(EFFECTS[effect][0] == "g4" for effect in pair) else "g10"
+        hidden = {name: value for effect in pair for name, value in EFFECTS[effect][1].items()}
+        rng = np.random.default_rng(7000 + seed)
+        specimen = replace(vary(Specimen(gap_mm=GAPS[gap]), rng), hidden=hidden)
+        yield Case("pair", f"{'+'.join(pair)} {gap}", seed, specimen, LABS["plain"], _test(gap),
+                   truth=pair)  # fmt: skip
+
+
 STRANGERS: dict[str, tuple[str, str, dict[str, float]]] = {
     "soft layer": ("g4", "bumper", {"soft_depth": 4e-4, "soft_share": 0.3}),
     "flexible mount": ("g4", "bumper", {"mount_k": 1.5e6}),
@@ -201,6 +226,7 @@ GROUPS = {
     "other": draw_other_cases,
     "effect": draw_effect_cases,
     "small": draw_small_cases,
+    "pair": draw_pair_cases,
     "stranger": draw_stranger_cases,
 }
 
@@ -272,8 +298,8 @@ def judge(row: dict[str, object]) -> str:
     blamed = any(e.startswith(("sensor_", "mass_error")) for e in effects)
     if row["group"] in ("component", "clean", "other"):
         return "right" if verdict == "none" and not row.get("blamed") else "wrong"
-    if row["group"] == "effect":
-        if verdict == "named" and effects == [*row["truth"]]:  # type: ignore[misc]
+    if row["group"] in ("effect", "pair"):
+        if verdict == "named" and sorted(effects) == sorted(row["truth"]):  # type: ignore[call-overload]
             return "right"
         return "open" if verdict in ("unexplained", "ambiguous") and not blamed else "wrong"
     if row["group"] == "small":

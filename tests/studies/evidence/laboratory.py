@@ -144,6 +144,7 @@ class Instruments:
     pink: float = 0.0  # corner of 1/f noise in Hz
     plate_kg: float = 0.0
     bits: int = 0  # of the converter, over the largest reading; 0 for a fine one
+    curve: float = 0.0  # of cells and accelerometers: too much at the largest reading, as a share
     skew_s: float = 0.0  # between successive channels of a multiplexed logger
     has_relative_laser: bool = False  # on the table: it reads the mass relative to that
     missing: tuple[str, ...] = ()
@@ -196,6 +197,8 @@ def _read(
     t = np.arange(values.size) / FINE_HZ
     gain = 1.0 + lab.gain * rng.standard_normal() if lab.gain else 1.0
     gain *= lab.faults.get(name, 1.0)
+    if lab.curve and not name.endswith("disp_m"):
+        values = values * (1.0 + lab.curve * values / np.abs(values).max())
     lag = abs(lab.lag_s * rng.standard_normal())
     read = gain * np.interp(t - lag, t, values)
     fine_noise = rng.standard_normal(values.size) * noise * np.sqrt(step if lab.filter_share else 1)
