@@ -14,6 +14,6 @@ def test_a_nuisance_that_nothing_determines_is_as_uncertain_as_its_prior() -> No
     prepared = prepare_problem([log()], SNM)
     (residuals,) = prepared.problem.log_residuals
     key = next(k for k in prepared.parameters.values if isinstance(k, NuisanceKey))
-    light = replace(residuals, weight=1e6)
+    light = replace(residuals, weights=dict.fromkeys((*residuals.rows, "rest"), 1e6))
     fit = fit_parameters([light], prepared.parameters)
     assert fit.std_errors[key] == pytest.approx(1.0, rel=0.05)

@@ -1,6 +1,5 @@
 """The content of verdict.json, from a discovery and the law that was proposed after it."""
 
-import math
 from collections.abc import Sequence
 
 from twin.discovery.candidates import Candidate
@@ -41,7 +40,7 @@ from twin.discovery.result import (
     Sensors,
     Verdict,
 )
-from twin.discovery.selection import FittedSet
+from twin.discovery.selection import FittedSet, SelectionProblem
 from twin.discovery.sensor_checks import SensorCheck, check_sensors
 from twin.discovery.verdict import (
     EXCLUDED_PROBABILITY,
@@ -74,7 +73,10 @@ def build_verdict(
     verdict, selection = discovery.verdict, discovery.selection
     best, null = verdict.best, selection.null
     where = discovery.localization
-    factor = noise_factor(discovery)
+    problem = discovery.prepared.problem
+    before, after, floor = (
+        problem.measure_misfit(null), problem.measure_misfit(best), find_noise_floor(discovery)
+    )  # fmt: skip
     names = best.names
     alternatives = [fitted.names for fitted in verdict.alternatives]
     blind_to = [effect.candidate.name for effect in verdict.blind_to]
@@ -89,7 +91,7 @@ def build_verdict(
         candidates=_list_candidates(
             selection.null,
             (*selection.tried, *([verdict.generic] if verdict.generic else [])),
-            factor,
+            problem,
         ),
         where=Location(
             frequency_hz=list(where.frequency_hz) if where.frequency_hz else None,
@@ -100,15 +102,15 @@ def build_verdict(
         ),
         gap=Gap(
             metric=METRIC,
-            given=factor * math.sqrt(discovery.given.cost),
-            before=factor * math.sqrt(null.fit.cost),
-            after=factor * math.sqrt(best.fit.cost),
-            noise_floor=factor * math.sqrt(verdict.floor),
-            held_out_before=factor * math.sqrt(null.cost),
-            held_out_after=factor * math.sqrt(best.cost),
-            closed_fraction=closed_fraction(null.cost, best.cost, verdict.floor),
+            given=problem.measure_misfit(discovery.given),
+            before=problem.measure_fitted_misfit(null),
+            after=problem.measure_fitted_misfit(best),
+            noise_floor=floor,
+            held_out_before=before,
+            held_out_after=after,
+            closed_fraction=closed_fraction(before, after, floor),
         ),
-        staircase=_build_staircase(discovery, factor, proposal),
+        staircase=_build_staircase(discovery, proposal),
         probability=[
             ExplanationResult(
                 effects=[*each.names], stranger=each.place, probability=each.probability
@@ -117,12 +119,12 @@ def build_verdict(
         ],
         excludes=_list_excluded_sizes(discovery),
         nuisances=_list_nuisances(discovery),
-        excluded=_list_excluded(discovery, factor),
+        excluded=_list_excluded(discovery),
         remainder=Remainder(
             unexplained=verdict.has_remainder,
-            evidence=_build_generic_term(verdict.generic, factor) if verdict.generic else None,
+            evidence=_build_generic_term(verdict.generic, problem) if verdict.generic else None,
         ),
-        law=_build_law(proposal, factor) if proposal else None,
+        law=_build_law(proposal, problem) if proposal else None,
         sensors=build_sensors(_check_discovery_sensors(discovery)),
         base=_build_base(best),
         fell_away=dict(discovery.prepared.excluded),
@@ -142,43 +144,39 @@ def build_verdict(
     )
 
 
-def _build_staircase(
-    discovery: Discovery, factor: float, proposal: LawProposal | None
-) -> list[MisfitStep]:
+def _build_staircase(discovery: Discovery, proposal: LawProposal | None) -> list[MisfitStep]:
     """Return the misfit step by step: as given, refitted, + each effect, noise floor.
 
     The effects are in the order in which each removes most; a set that was not fitted is left out.
     """
     selection, verdict = discovery.selection, discovery.verdict
-    steps = [
-        ("model as given", discovery.given.cost),
-        ("refitted, no effect", selection.null.cost),
-    ]
-    costs = {frozenset(fitted.names): fitted.cost for fitted in selection.tried}
-    costs[frozenset(verdict.best.names)] = verdict.best.cost
+    steps = [("model as given", discovery.given), ("refitted, no effect", selection.null)]
+    sets = {frozenset(fitted.names): fitted for fitted in selection.tried}
+    sets[frozenset(verdict.best.names)] = verdict.best
     if proposal is not None:
-        costs[frozenset(proposal.start.names)] = proposal.start.cost
+        sets[frozenset(proposal.start.names)] = proposal.start
     added: frozenset[str] = frozenset()
     best = frozenset(proposal.start.names if proposal else verdict.best.names)
     while added != best:
-        larger = [names for names in costs if added < names <= best]
+        larger = [names for names in sets if added < names <= best]
         smallest = min(map(len, larger))
-        names = min((n for n in larger if len(n) == smallest), key=lambda n: costs[n])
-        steps.append((f"+ {' + '.join(sorted(names - added))}", costs[names]))
+        names = min((n for n in larger if len(n) == smallest), key=lambda n: sets[n].cost)
+        steps.append((f"+ {' + '.join(sorted(names - added))}", sets[names]))
         added = names
     generic = verdict.generic if proposal is None else None
     if proposal is not None:
-        steps.append(("with the proposed law", proposal.fitted.cost))
+        steps.append(("with the proposed law", proposal.fitted))
     if generic is not None and verdict.outcome == "unexplained":
         term = generic.names[-1].split(".", 1)[1]
-        steps.append((f"with the general law {term}", generic.cost))
-    steps.append(("noise floor", verdict.floor))
+        steps.append((f"with the general law {term}", generic))
+    measure = discovery.prepared.problem.measure_misfit
     return [
-        MisfitStep(label=label, misfit=factor * math.sqrt(max(cost, 0.0))) for label, cost in steps
+        *(MisfitStep(label=label, misfit=measure(fitted)) for label, fitted in steps),
+        MisfitStep(label="noise floor", misfit=find_noise_floor(discovery)),
     ]
 
 
-def _list_excluded(discovery: Discovery, factor: float) -> list[ExcludedSet]:
+def _list_excluded(discovery: Discovery) -> list[ExcludedSet]:
     """Return the sets of as many other effects as the best, best first, and how much worse."""
     best, problem = discovery.verdict.best, discovery.prepared.problem
     probabilities = sum_by_set(discovery.selection.explanations)
@@ -190,7 +188,7 @@ def _list_excluded(discovery: Discovery, factor: float) -> list[ExcludedSet]:
     return [
         ExcludedSet(
             id=" + ".join(rival.names),
-            held_out_error=factor * math.sqrt(rival.cost),
+            held_out_error=problem.measure_misfit(rival),
             sigma=problem.compute_gain(rival, best)[2],
         )
         for names, rival in rivals.items()
@@ -298,15 +296,9 @@ def build_sensors(checks: Sequence[SensorCheck]) -> Sensors:
     return Sensors(state="healthy" if is_healthy else "to be mended", checks=rows)
 
 
-def noise_factor(discovery: Discovery) -> float:
-    """Return the factor from weighted residuals to multiples of the sensor noise.
-
-    Where model error rules, residuals are divided by it in place of the noise, log by log.
-    """
-    log_residuals = discovery.prepared.problem.log_residuals
-    counts = [residuals.entry_row.size for residuals in log_residuals]
-    squares = [residuals.weight**2 for residuals in log_residuals]
-    return math.sqrt(sum(n * w for n, w in zip(counts, squares, strict=True)) / sum(counts))
+def find_noise_floor(discovery: Discovery) -> float:
+    """Return the rms over the noise that noise alone leaves; below 1 where it was overestimated."""
+    return min(1.0, discovery.prepared.problem.measure_misfit(discovery.verdict.best))
 
 
 def _build_effect(candidate: Candidate, fit: FitResult, confidence: float) -> EffectResult:
@@ -385,19 +377,19 @@ def format_reason(discovery: Discovery) -> str:
 
 
 def _list_candidates(
-    null: FittedSet, tried: Sequence[FittedSet], factor: float
+    null: FittedSet, tried: Sequence[FittedSet], problem: SelectionProblem
 ) -> list[CandidateResult]:
-    """Return every refitted set with its cross-validation error, times a factor, best first."""
+    """Return every refitted set with its cross-validation error, best first."""
     best: dict[frozenset[str], FittedSet] = {}
     for fitted in (null, *tried):
         key = frozenset(fitted.names)
         if key not in best or fitted.cost < best[key].cost:
             best[key] = fitted
     candidates = []
-    for fitted in sorted(best.values(), key=lambda fitted: fitted.cost):
+    for fitted in sorted(best.values(), key=problem.measure_misfit):
         candidate = CandidateResult(
             id=" + ".join(fitted.names) or "nothing added",
-            held_out_error=factor * math.sqrt(fitted.cost),
+            held_out_error=problem.measure_misfit(fitted),
             converged=fitted.fit.converged,
         )
         if fitted.fit.at_bound:
@@ -406,13 +398,13 @@ def _list_candidates(
     return candidates
 
 
-def _build_generic_term(general: FittedSet, factor: float) -> GenericTerm:
+def _build_generic_term(general: FittedSet, problem: SelectionProblem) -> GenericTerm:
     """Return the generic term that fits better than every library effect."""
     term = general.effects[-1]
     return GenericTerm(
         term=term.name.split(".", 1)[1],
         meaning="u, v, d relative to their largest measured values, w likewise (resonator: Hz)",
-        held_out_error=factor * math.sqrt(general.cost),
+        held_out_error=problem.measure_misfit(general),
         parameters={
             free.key.name: build_parameter(general.fit, free)
             for free in term.free
@@ -421,7 +413,9 @@ def _build_generic_term(general: FittedSet, factor: float) -> GenericTerm:
     )
 
 
-def _build_law(proposal: LawProposal, factor: float) -> ProposedLaw:
+def _build_law(proposal: LawProposal, problem: SelectionProblem) -> ProposedLaw:
+    before, after = problem.measure_misfit(proposal.start), problem.measure_misfit(proposal.fitted)
+    floor = min(1.0, after)
     fitted = proposal.fitted
     terms = fitted.effects[len(proposal.start.effects) :]
     return ProposedLaw(
@@ -445,17 +439,17 @@ def _build_law(proposal: LawProposal, factor: float) -> ProposedLaw:
         with_effects=[*proposal.start.names],
         base=_build_base(fitted),
         law_class=proposal.law_class,
-        held_out_before=factor * math.sqrt(proposal.start.cost),
-        held_out_after=factor * math.sqrt(fitted.cost),
-        noise_floor=factor * math.sqrt(proposal.floor),
-        closed_fraction=proposal.closed_share,
+        held_out_before=before,
+        held_out_after=after,
+        noise_floor=floor,
+        closed_fraction=closed_fraction(before, after, floor),
         sufficient=proposal.is_sufficient,
         nearest=proposal.nearest,
         classes=[
             LawClass(
                 law_class=name,
                 id=best.names[-1],
-                held_out_error=factor * math.sqrt(best.cost),
+                held_out_error=problem.measure_misfit(best),
             )
             for name, best in proposal.by_class
         ],

@@ -330,10 +330,11 @@ def _judge(
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
+    noise = min(1.0, problem.measure_misfit(verdict.best)) ** 2
     null_samples, of_null = _evaluate_samples(problem, selection.null)
-    before = build_cells(null_samples, of_null, floor)
+    before = build_cells(null_samples, of_null, noise)
     localization = localize_excess(null_samples, of_null, before, steps)
-    after = build_cells(*_evaluate_samples(problem, verdict.best), floor)
+    after = build_cells(*_evaluate_samples(problem, verdict.best), noise)
     given = evaluate_given(prepared.problem, model)
     return Discovery(prepared, given, selection, verdict, localization, before, after, notes)
 
@@ -341,7 +342,7 @@ def _judge(
 def _evaluate_samples(
     problem: SelectionProblem, fitted: FittedSet
 ) -> tuple[tuple[LogResiduals, ...], tuple[Float1D, ...]]:
-    """Return (residuals at the samples, their values over the noise for a set, (entry,))."""
+    """Return (residuals at the samples, a set's values over the noise of sensors, (entry,))."""
     parameters = fitted.fit.parameters
     sampled = tuple(resolve_samples(each, parameters) for each in problem.log_residuals)
-    return sampled, tuple(residuals.evaluate(parameters) for residuals in sampled)
+    return sampled, tuple(each.evaluate(parameters) * each.entry_weight for each in sampled)

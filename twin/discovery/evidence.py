@@ -28,7 +28,7 @@ from table_io.block import Float1D, Float2D, Int1D
 from twin.discovery.candidates import Candidate
 from twin.discovery.least_squares import INTERVAL_SIGMA, MapFunction, compute_slopes
 from twin.discovery.parameters import FreeParameter, ParameterSet
-from twin.discovery.residuals import LogResiduals, expected_level
+from twin.discovery.residuals import LogResiduals
 from twin.discovery.screening import Variant, assign_units
 from twin.discovery.strangers import compute_stranger_forces
 
@@ -67,7 +67,7 @@ class LinearEvidence:
     scale: Float1D  # norm of each column before the base was absorbed
     force: float  # norm of the measured forces
     inflation: float  # of the covariance of the scores, which holds it
-    level: float  # mean square over the noise that the richest model leaves
+    level: float  # mean square over noise and unknown errors that the richest model leaves
 
     @cached_property
     def _precision(self) -> Float1D:
@@ -263,7 +263,8 @@ def build_evidence(
     ]
     return _absorb_base(
         columns, noisy @ noisy.T, len(free), unit, tuple(variants), places,
-        _measure_force(log_residuals), rich_columns, expected_level(log_residuals),
+        _measure_force(log_residuals), rich_columns,
+        np.concatenate([residuals.expected_entries for residuals in log_residuals]),
     )  # fmt: skip
 
 
@@ -335,7 +336,7 @@ def _measure_force(log_residuals: Sequence[LogResiduals]) -> float:
 
 def _absorb_base(
     columns: Float2D, noise: Float2D, base: int, unit: Int1D, variants: tuple[Variant, ...],
-    places: dict[str, Int1D], force: float, rich: Sequence[int], expected: float,
+    places: dict[str, Int1D], force: float, rich: Sequence[int], expected: Float1D,
 ) -> LinearEvidence:  # fmt: skip
     """Return the linear model; `columns` are those of base, candidates, stranger, and the residual.
 
@@ -393,9 +394,9 @@ def _make_positive(products: Float2D) -> Float2D:
 
 
 def _measure_inflation(
-    rest: Float2D, r: Float1D, unit: Int1D, count: int, rich: Sequence[int], expected: float
+    rest: Float2D, r: Float1D, unit: Int1D, count: int, rich: Sequence[int], expected: Float1D
 ) -> tuple[float, float]:
-    """Return (variance inflation of scores, mean square) of what the richest model leaves.
+    """Return (variance inflation of scores, level) of what the richest model leaves.
 
     That model has the stranger at every place, the columns `rich`, and the column itself: what is
     left scatters between the units (steps) more than its samples say where these are correlated.
@@ -406,7 +407,7 @@ def _measure_inflation(
     if len(chosen):
         solution = np.linalg.lstsq(chosen @ chosen.T, chosen @ r, rcond=1e-8)[0]
         left = r - solution @ chosen
-    level = float(left @ left) / max(r.size, 1)
+    level = float(np.mean(left**2 / expected))
     ratios = []
     units = int(unit.max(initial=0)) + 1
     for column in rest[:count]:
@@ -420,7 +421,7 @@ def _measure_inflation(
         scatter = float(sums @ sums) * effective / max(effective - 1.0, 1.0)
         ratios.append(scatter / max(float(square @ left**2), 1e-300))
     correlated = float(np.median(ratios)) if ratios else 1.0
-    return max(1.0, correlated) * max(1.0, level / expected), level
+    return max(1.0, correlated) * max(1.0, level), level
 
 
 def softmax(states: Sequence[Hypothesis]) -> Float1D:

@@ -391,7 +391,7 @@ def make_residuals(
     number = last.log_number + 1
     signals = build_signals((readings,), motion.name, motion.mass_kg, motion.gaps_m)
     residuals = LogResiduals(
-        number, signals, last.contact_n, last.reference, last.scale, last.weight, last.thinning,
+        number, signals, last.contact_n, last.reference, last.scale, last.weights, last.thinning,
         noise_scale=last.noise_scale,
     )  # fmt: skip
     if last.nuisances is None:
@@ -540,7 +540,7 @@ def _compare_entries(
     difference = entries[-1] - true_entries[-1]
     gain += float(difference @ difference)
     sigma = math.copysign(math.sqrt(0.25 * abs(gain)), gain)
-    misfit = math.sqrt(mean_square(entries[-1:])) * joint.log_residuals[-1].weight
+    misfit = math.sqrt(mean_square([entries[-1] * joint.log_residuals[-1].entry_weight]))
     return PairSeparation(truth, other, sigma, misfit, _find_threshold(joint))
 
 

@@ -223,7 +223,7 @@ def entries_to_samples(
     """
     in_row = residuals.entry_row == row
     samples = np.full(residuals.signals.time_s.size, np.nan)
-    samples[residuals.entry_sample[in_row]] = values[in_row] * residuals.weight
+    samples[residuals.entry_sample[in_row]] = values[in_row] * residuals.entry_weight[in_row]
     if not is_force(residuals, row):
         return samples
     m, mass = _assumed_motion(residuals, parameters)
@@ -332,7 +332,7 @@ def check_instruments(view: DiscoveryView) -> list[InstrumentGate]:
             in_row = residuals.entry_row == row
             if row < len(FORCE_ROWS) or not in_row.any():
                 continue
-            squares = [(r[in_row] * residuals.weight) ** 2 for r in held_out]
+            squares = [(r * residuals.entry_weight)[in_row] ** 2 for r in held_out]
             blocks = np.unique(residuals.entry_block[in_row], return_inverse=True)[1]
             sums = np.bincount(blocks, weights=squares[0] - 1.0)
             sigma = sums.sum() / max(math.sqrt(float(sums @ sums)), 1e-300)
@@ -350,7 +350,7 @@ def check_instruments(view: DiscoveryView) -> list[InstrumentGate]:
             )
         at_rest = residuals.entry_row == len(residuals.rows)
         rest_values = (
-            r[at_rest][: len(residuals.rest_channels)] * residuals.weight for r in held_out
+            (r * residuals.entry_weight)[at_rest][: len(residuals.rest_channels)] for r in held_out
         )
         values = zip(residuals.rest_channels, *rest_values, strict=True)
         for channel, before, after in values:

@@ -17,7 +17,7 @@ from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
 from table_io.records import Step
-from twin.discovery.build_verdict import noise_factor
+from twin.discovery.build_verdict import find_noise_floor
 from twin.discovery.figure_data import DiscoveryView, is_periodic, list_phases
 from twin.discovery.force_figures import (
     GENERIC_COLOUR,
@@ -317,7 +317,7 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
                 ax.yaxis.set_major_formatter("{x:g}")
                 ax.yaxis.set_minor_formatter("")
         for ax, name in zip(axes, rows, strict=True):
-            floor = noise_factor(view.discovery) ** 2 * view.discovery.verdict.floor
+            floor = find_noise_floor(view.discovery) ** 2
             low, high = ax.get_ylim()
             ax.axhline(floor, color=TWIN_COLOUR, ls="--", lw=0.9)
             ax.set_ylim(min(low, 0.08 * floor), max(high, 12 * floor))
@@ -349,7 +349,7 @@ def _block_means(
         np.bincount(blocks, weights=residuals.signals.time_s[residuals.entry_sample[in_rows]])
         / count
     )
-    squares = (residuals.weight * held_out[in_rows]) ** 2
+    squares = (residuals.entry_weight * held_out)[in_rows] ** 2
     return t, np.bincount(blocks, weights=squares) / count
 
 

@@ -79,7 +79,7 @@ class IdentificationResult:
         """Rms of the residual in motion over the noise of the sensors, whatever the weights."""
         squares, count = 0.0, 0
         for residuals in self.problem.log_residuals:
-            r = residuals.evaluate(self.fit.parameters) * residuals.weight
+            r = residuals.evaluate(self.fit.parameters) * residuals.entry_weight
             r = r[residuals.entry_row < len(residuals.rows)]
             squares, count = squares + float(r @ r), count + r.size
         return math.sqrt(squares / max(count, 1))

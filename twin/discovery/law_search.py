@@ -62,11 +62,6 @@ class LawProposal:
     by_class: tuple[tuple[str, FittedSet], ...]
 
     @property
-    def closed_share(self) -> float:
-        """Share of the held-out misfit over the floor that the law closes."""
-        return closed_fraction(self.start.cost, self.fitted.cost, self.floor)
-
-    @property
     def floor_ratio(self) -> float:
         """Ratio of the held-out error (rms) to the floor."""
         return math.sqrt(self.fitted.cost / self.floor)
@@ -130,7 +125,7 @@ def select_law(
         key=lambda start: len(start.effects),
     )
     floor = min(floor, best.cost)
-    closed_share = closed_fraction(starts[0].cost, best.cost, floor)
+    closed_share = closed_fraction(*map(math.sqrt, (starts[0].cost, best.cost, floor)))
     if closed_share < MIN_CLOSED_SHARE or not problem.is_worthwhile(start, best):
         return None
     terms = best.effects[len(start.effects) :]

@@ -16,7 +16,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     get_log,
 )
-from twin.discovery.residuals import MAX_LEVEL, LogResiduals, expected_level
+from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
 
 MAX_ITERATIONS = 40
 MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
@@ -109,19 +109,23 @@ def fit_with_misfit(
     cross-validation residual of the result are over the noise alone nevertheless.
     """
     fit = fit_parameters(log_residuals, start, mapper=mapper)
-    if not fit.free or fit.cost <= MAX_LEVEL * expected_level(log_residuals):
+    left = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
+    if not fit.free or measure_level(log_residuals, left) <= MAX_LEVEL:
         return fit_parameters(
             log_residuals, fit.parameters, folds=folds, mapper=mapper, without_noise=True
         )
     weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
-    ratios = [new.weight / old.weight for new, old in zip(weighted, log_residuals, strict=True)]
+    ratios = [
+        new.entry_weight / old.entry_weight
+        for new, old in zip(weighted, log_residuals, strict=True)
+    ]
     fit = fit_parameters(weighted, fit.parameters, folds=folds, mapper=mapper, without_noise=True)
     entries = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
     held_out = tuple(
         np.where(residuals.entry_row < len(residuals.rows), ratio, 1.0) * values
         for values, residuals, ratio in zip(fit.held_out, log_residuals, ratios, strict=False)
     )
-    white = min(ratios)
+    white = min(float(ratio.min()) for ratio in ratios)
     return replace(
         fit,
         cost=sum(float(values @ values) for values in entries) / sum(map(len, entries)),
@@ -342,10 +346,10 @@ class _LevenbergMarquardt:
                 [np.bincount(blocks, weights=row[moving] * r[moving]) for row in jacobian]
             )
             # A rest row has a single entry: its variance is that of the noise, of a prior 1.
-            rest_slopes = jacobian[:, moving.stop : last] / residuals.weight
-            priors = residuals.prior_count
-            if priors:
-                rest_slopes[:, -priors:] *= residuals.weight
+            weight = residuals.entry_weight
+            if self.train is not None:
+                weight = weight[self.train[log]]
+            rest_slopes = jacobian[:, moving.stop : last] / weight[moving.stop - first :]
             information.append(
                 [np.bincount(blocks, row[moving] ** 2).astype(np.float64) for row in jacobian]
             )

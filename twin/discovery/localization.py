@@ -150,7 +150,7 @@ def find_pulling_bumpers(
             if mask is None or not mask.any():
                 continue
             # of the noise of the sensors, whatever else the weight of a log counts
-            if residuals.weight**2 * np.mean(r[mask] ** 2) > MIN_PULL_MEAN_SQUARE:
+            if np.mean((residuals.entry_weight * r)[mask] ** 2) > MIN_PULL_MEAN_SQUARE:
                 side = name.split()[0]
                 messages.append(
                     f"{residuals.signals.name}: the {side} bumper pulls after release, as if it "

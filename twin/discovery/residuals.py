@@ -132,7 +132,9 @@ class LogResiduals:
     contact_n: float
     reference: Model
     scale: RecordScale
-    weight: float = 1.0  # noise multiplier; above 1 where model error, not noise, limits the fit
+    # Noise multiplier of each row, and of "rest", by name; above 1 where errors that are no noise
+    # of a sensor limit the fit.
+    weights: Mapping[str, float] = field(default_factory=dict)
     thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
     nuisances: NuisanceTerms | None = None
     known_contact: npt.NDArray[np.int8] | None = None  # (2, sample), else from the load cells
@@ -141,7 +143,8 @@ class LogResiduals:
     # Of the residuals that these are a copy of: noise of the rows, and samples of each row.
     fixed_noise: tuple[Float1D, ...] | None = None
     fixed_mask: Bool2D | None = None
-    expected_square: float = 1.0  # mean square of entries of noise and unknown errors alone
+    # Mean square of the entries of each row, by name, of noise and unknown errors alone.
+    expected_squares: Mapping[str, float] = field(default_factory=dict)
     is_sampled: bool = False  # entries are samples, for maps and subsets, in place of facts
     motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
 
@@ -351,6 +354,29 @@ class LogResiduals:
         """Number of residual entries in the rest row."""
         return len(self.rest_channels) + len(self.signals.zero_channels) + self.prior_count
 
+    @cached_property
+    def entry_weight(self) -> Float1D:
+        """Noise multiplier of each entry, (entry,); the priors of nuisances keep their own."""
+        by_row = np.array([self.weights.get(name, 1.0) for name in (*self.rows, "rest")])
+        weight: Float1D = by_row[self.entry_row]
+        weight[weight.size - self.prior_count :] = 1.0
+        return weight
+
+    @cached_property
+    def expected_entries(self) -> Float1D:
+        """Mean square of each entry, (entry,), of noise and unknown errors alone."""
+        by_row = [self.expected_squares.get(name, 1.0) for name in self.rows]
+        at_rest = self.weights.get("rest", 1.0) ** -2
+        expected: Float1D = np.array([*by_row, at_rest])[self.entry_row]
+        expected[expected.size - self.prior_count :] = 1.0
+        return expected
+
+    @property
+    def sensor_square(self) -> float:
+        """Mean square of the entries in motion of the noise of sensors alone."""
+        moving = self.entry_weight[self.entry_row < len(self.rows)]
+        return float(np.mean(moving**-2.0)) if moving.size else 1.0
+
     @property
     def prior_count(self) -> int:
         """Number of priors of nuisances, the last entries."""
@@ -460,14 +486,13 @@ class LogResiduals:
         rows, rest = self._list_rows(parameters, m), self._rest_entries(parameters)
         if self.nuisances is None:
             entries = np.concatenate([*rows, rest])
-            entries /= self.weight
+            entries /= self.entry_weight
             return _bound_diverged(entries)
         values, columns = self.nuisances.values(parameters), self.nuisances.columns
         priors = self.nuisances.centre + values
         entries = np.concatenate([*rows, rest, priors])
         entries[: columns.shape[1]] += values.astype(np.float32) @ columns
-        # the priors keep their weight where model error limits the fit
-        entries[: entries.size - priors.size] /= self.weight
+        entries /= self.entry_weight
         return _bound_diverged(entries)
 
     @property
@@ -489,7 +514,7 @@ class LogResiduals:
         if self.nuisances is not None and key in self.nuisances.keys:
             number, count = self.nuisances.keys.index(key), len(self.nuisances.keys)
             column = self.nuisances.columns[number]
-            slope[: column.size] = column / self.weight
+            slope[: column.size] = column / self.entry_weight[: column.size]
             slope[slope.size - count + number] = 1.0
         return slope
 
@@ -637,8 +662,8 @@ class LogResiduals:
         the forms of the laws that the model has beside its `base`, of their own force: the weight
         counts these errors as noise of single steps.
         """
-        r = self.evaluate(parameters) * self.weight
-        laws = np.zeros(r.size) if base is None else self.evaluate(base) * self.weight - r
+        r = self.evaluate(parameters) * self.entry_weight
+        laws = np.zeros(r.size) if base is None else self.evaluate(base) * self.entry_weight - r
         # a sensor that others show to be louder is louder in the forces, too
         sensors = [row for row, name in enumerate(self.rows) if name not in FORCE_ROWS]
         forces = [row for row, name in enumerate(self.rows) if name in FORCE_ROWS]
@@ -652,32 +677,50 @@ class LogResiduals:
                     scale[name] = scale.get(name, 1.0) * math.sqrt(change)
             learned = replace(learned, noise_scale=scale)
             louder[: r.size - self._rest_entry_count] = learned._entry_noise / self._entry_noise
-        laws /= louder
-        measured = learned.measured_entries * learned.weight
-        squares = measured**2
-        forms = laws[self.entry_row < len(self.rows)] ** 2
-        # laws that nearly cancel each other show no more of their form than what they explain
-        forms *= min(1.0, float(squares.sum()) / max(float(forms.sum()), 1e-300))
-        errors = ((UNKNOWN_ERROR_SHARE, squares), (FORM_ERROR_SHARE, forms))
-        parts = [(share**2 * float(of.sum()), learned._count_different(of)) for share, of in errors]
-        weight = math.sqrt(1.0 + sum(part / count for part, count in parts))
         terms = self.nuisances
         if terms is not None:
             columns = terms.columns / louder[: terms.columns.shape[1]]
             terms = replace(terms, columns=columns.astype(np.float32))
-        # a name must leave no more than instruments do, whatever form its law has
-        expected = (1.0 + parts[0][0] / max(squares.size, 1)) / weight**2
-        return replace(learned, weight=weight, expected_square=expected, nuisances=terms)
+        weights, expected = learned._measure_errors((laws / louder)[: learned.entry_row.size])
+        return replace(learned, weights=weights, expected_squares=expected, nuisances=terms)
+
+    def _measure_errors(self, laws: Float1D) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the weights and the expected mean squares of the rows, by name.
+
+        `laws`, (entry,), are the forces of the laws beside the base, over the noise: the form of
+        a bumper's law is no error of the damper's.
+        """
+        read = (self.measured_entries * self.entry_weight) ** 2
+        unknown = UNKNOWN_ERROR_SHARE**2 * float(read.sum()) / self._count_different(read)
+        weights = dict.fromkeys((*self.rows, "rest"), math.sqrt(1.0 + unknown))
+        expected = dict.fromkeys(self.rows, weights["rest"] ** -2)
+        for row, name in enumerate(self.rows):
+            own = self.entry_row == row
+            if name not in FORCE_ROWS or not own.any():
+                continue
+            squares, forms = read[own], laws[own] ** 2
+            # laws that nearly cancel each other show no more of their form than what they explain
+            forms *= min(1.0, float(squares.sum()) / max(float(forms.sum()), 1e-300))
+            errors = UNKNOWN_ERROR_SHARE**2 * squares, FORM_ERROR_SHARE**2 * forms
+            parts = [float(of.sum()) / self._count_different(of) for of in errors]
+            weights[name] = math.sqrt(1.0 + sum(parts))
+            # a name must leave no more than instruments do, whatever form its law has
+            expected[name] = (1.0 + float(errors[0].mean())) / weights[name] ** 2
+        return weights, expected
 
     def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
         """Return the residuals with what a fitted model leaves counted as noise of single steps.
 
         So the priors of the nuisances are not outvoted by a misfit that is no error of theirs.
         """
-        squares = self.evaluate(parameters)[self.entry_row < len(self.rows)] ** 2
-        excess = max(float(squares.sum()) - self.expected_square * squares.size, 0.0)
-        misfit = excess / self._count_different(squares)
-        return replace(self, weight=self.weight * math.sqrt(1.0 + misfit))
+        squares, factors = self.evaluate(parameters) ** 2, {}
+        for row, name in enumerate(self.rows):
+            own = squares[self.entry_row == row]
+            excess = max(float(own.sum()) - self.expected_squares.get(name, 1.0) * own.size, 0.0)
+            factors[name] = math.sqrt(1.0 + excess / self._count_different(own))
+        factors["rest"] = max(factors.values())
+        weights = {name: factor * self.weights.get(name, 1.0) for name, factor in factors.items()}
+        return replace(self, weights=weights)
 
     def _count_different(self, squares: Float1D) -> float:
         """Return how many different errors entries with these squares are, (entry,).
@@ -701,7 +744,7 @@ class LogResiduals:
         sample, m = self.entry_sample[facts], self.motion()
         measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
         variances = []
-        force = self.measured_entries[facts] * self.weight
+        force = self.measured_entries[facts] * self.entry_weight[facts]
         for number in np.unique(m.step[sample][measured]):
             chosen = measured & (m.step[sample] == number)
             cycles, index = np.unique(m.cycle[sample][chosen], return_inverse=True)
@@ -782,10 +825,10 @@ class LogResiduals:
         entries = np.zeros(self.entry_row.size)
         first = 0
         for row, basis, noise in zip(rows, self.bases, self._row_noise, strict=False):
-            values = (row if basis is None else basis.project(row)) / noise / self.weight
+            values = (row if basis is None else basis.project(row)) / noise
             entries[first : first + values.size] = values
             first += values.size
-        return entries
+        return entries / self.entry_weight
 
     def _correct_consistency(
         self, consistency: ConsistencyResidual, parameters: ParameterSet
@@ -844,10 +887,18 @@ class LogResiduals:
         return np.array(entries)
 
 
-def expected_level(log_residuals: Sequence[LogResiduals]) -> float:
-    """Return the mean square over the entries of all logs that instruments alone leave."""
-    squares = sum(r.expected_square * r.entry_row.size for r in log_residuals)
-    return squares / sum(r.entry_row.size for r in log_residuals)
+def measure_level(
+    log_residuals: Sequence[LogResiduals], entries: Sequence[Float1D], moving_only: bool = False
+) -> float:
+    """Return the mean of the squares of entries over what noise and unknown errors alone leave.
+
+    `entries`, (entry,) per log, are residuals; at rest no force of a model acts.
+    """
+    ratios = []
+    for residuals, values in zip(log_residuals, entries, strict=True):
+        ratio = values**2 / residuals.expected_entries
+        ratios.append(ratio[residuals.entry_row < len(residuals.rows)] if moving_only else ratio)
+    return float(np.concatenate(ratios).mean())
 
 
 def build_log_residuals(

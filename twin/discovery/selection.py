@@ -17,7 +17,7 @@ from twin.discovery.candidates import Candidate, list_generic_candidates
 from twin.discovery.evidence import Hypothesis, LinearEvidence, build_evidence, softmax
 from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
-from twin.discovery.residuals import LogResiduals, expected_level
+from twin.discovery.residuals import LogResiduals, measure_level
 from twin.discovery.screening import (
     NormalEquations,
     ScreenedCandidate,
@@ -120,47 +120,50 @@ class SelectionProblem:
         return FittedSet(tuple(effects), result)
 
     @property
-    def least_weight(self) -> float:
-        """Weight of the log whose residual is closest to its noise."""
-        return min(residuals.weight for residuals in self.log_residuals)
-
-    @property
     def noise(self) -> float:
         """Mean square of the noise of sensors alone, of the log that shows it best."""
-        return self.least_weight**-2
+        return max(residuals.sensor_square for residuals in self.log_residuals)
 
     @property
     def expected_square(self) -> float:
         """Mean square of the entries where the model is right: noise, and unknown errors."""
-        return expected_level(self.log_residuals)
+        return float(np.concatenate([r.expected_entries for r in self.log_residuals]).mean())
 
     @cached_property
     def folds(self) -> tuple[Int1D, ...]:
         """Cross-validation fold of each entry, (entry,) per log."""
         return tuple(assign_folds(residuals) for residuals in self.log_residuals)
 
+    def measure_misfit(self, fitted: FittedSet) -> float:
+        """Return the rms over the noise of the sensors of the cross-validation residual."""
+        squares, count = 0.0, 0
+        for held_out, residuals in zip(fitted.held_out, self.log_residuals, strict=True):
+            moving = residuals.entry_row < len(residuals.rows)
+            r = (held_out * residuals.entry_weight)[moving]
+            squares, count = squares + float(r @ r), count + r.size
+        return math.sqrt(squares / max(count, 1))
+
+    def measure_fitted_misfit(self, fitted: FittedSet) -> float:
+        """Return the same of the data that a set was fitted to."""
+        entries = tuple(each.evaluate(fitted.fit.parameters) for each in self.log_residuals)
+        return self.measure_misfit(replace(fitted, fit=replace(fitted.fit, held_out=entries)))
+
     def measure_level(self, fitted: FittedSet) -> float:
-        """Return the mean square of the residual in motion: at rest no force of a model acts."""
-        rows = [
-            held_out[residuals.entry_row < len(residuals.rows)]
-            for held_out, residuals in zip(fitted.held_out, self.log_residuals, strict=True)
-        ]
-        return mean_square(rows)
+        """Return the level of the residual in motion; 1 if it is noise and unknown errors."""
+        return measure_level(self.log_residuals, fitted.held_out, moving_only=True)
 
     def measure_noise(self, fitted: FittedSet) -> float:
-        """Return the mean square in motion that the noise of the readings leaves of a model.
+        """Return the level in motion that the noise of the readings leaves of a model.
 
         It is that of the model itself: where a law is steep, as friction at the reversal of a
         motion, the noise of the motion is louder than in any other model.
         """
         parameters = fitted.fit.parameters
-        rows = [
-            (each.noise_copy.evaluate(parameters) - each.evaluate(parameters))[
-                each.entry_row < len(each.rows)
-            ]
+        noise = [
+            each.noise_copy.evaluate(parameters) - each.evaluate(parameters)
             for each in self.log_residuals
         ]
-        return mean_square(rows)
+        return measure_level(self.log_residuals, noise, moving_only=True)
 
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""

@@ -87,7 +87,7 @@ def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tupl
         checks += _check_noise(signals)
         checks += compare_sensors(signals)
         checks += _check_cells(signals)
-        if fit.cost * residuals.weight**2 <= MAX_EXPLAINED_COST:
+        if fit.cost <= MAX_EXPLAINED_COST * residuals.sensor_square:
             checks += _check_fitted(residuals, fit)
     return tuple(checks)
 

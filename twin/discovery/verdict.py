@@ -70,7 +70,7 @@ def judge_selection(
     by_set = sum_by_set(selection.explanations)
     probability = by_set.get(frozenset(best.names), 0.0)
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
-    noise = max(problem.expected_square, problem.measure_noise(best), floor)
+    noise = max(1.0, problem.measure_noise(best))
     remains = problem.measure_level(best) > MAX_LEVEL * noise
     has_remainder = beside > 0.5 or remains
     generic = None
@@ -214,9 +214,8 @@ def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> Discov
 
 
 def closed_fraction(before: float, after: float, floor: float) -> float:
-    """Return (before - after) / (before - floor) of the roots of the given mean squares."""
-    b, a, f = (math.sqrt(max(x, 0.0)) for x in (before, after, floor))
-    return (b - a) / (b - f) if b > f else 0.0
+    """Return the share of a misfit over its floor that is closed; rms values."""
+    return (before - after) / (before - floor) if before > floor else 0.0
 
 
 def suggest_next_run(

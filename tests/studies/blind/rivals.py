@@ -166,7 +166,7 @@ class RegressionProblem:
         residuals, m = self.residuals, self.motion
         samples, rows = residuals.entry_sample[entries], residuals.entry_row[entries]
         mass = self.parameters.model_for_log(residuals.log_number, m).parameters.mass
-        noise = residuals.force_noise(m, mass)[rows] * residuals.weight
+        noise = residuals.force_noise(m, mass)[rows] * residuals.entry_weight[entries]
         values = np.stack([*base, *columns.values()], axis=1)
         values = (values[samples] if by_sample else values) / noise[:, None]
         force = residuals.measured_forces(m, mass, self.parameters)[rows, samples] / noise
@@ -196,7 +196,7 @@ def make_regression_problem(log: PreparedLog, model: Model) -> RegressionProblem
     """Build the problem of a log, with the base model refitted; InputError as in discovery."""
     prepared = prepare_problem([log], model)
     sampled = resolve_samples(prepared.problem.log_residuals[0], prepared.parameters)
-    residuals = replace(sampled, weight=1.0)
+    residuals = replace(sampled, weights={})
     assert residuals.whitening is None, "baselines use unwhitened residuals"
     assert residuals.rows[: len(FORCE_ROWS)] == FORCE_ROWS
     return RegressionProblem(residuals, prepared.parameters)
