@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import spectrogram
+from scipy.stats import chi2
 
 from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
@@ -40,6 +41,7 @@ MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 MIN_BAND_RATIO, BAND_OF_FILTER = 4.0, 0.7
 BAND_ROLL_OFF = 2.0  # end of the low pass of the motion over the end of that band
 WIENER_SEGMENT_S, WIENER_LINES = 4.0, 9  # in which the power of a motion is averaged
+EVENT_S, MAX_EVENT_CHANCE = 0.05, 1e-3  # a short event, and the probability that noise looks so
 MAX_CHANCE_POWER = 3.0  # of the loudest of some tens of such averages of noise, over its mean
 NOISE_SEED = 20_26, 0  # of the copy of the noise: the same recording gives the same verdict
 MAX_NOISE_RATIO = 4.0  # noise in motion over that at rest: sensors that disagree more are faulty
@@ -544,8 +546,27 @@ def build_signals(
     signals = replace(signals, low_pass=low_pass, band_hz=band_hz)
     if derives_acc(columns):
         return signals
-    gain = pass_motion(signals, signals.fuse_motion().u, signals.motion_density)
-    return replace(signals, motion_pass=gain)
+    u, density = signals.fuse_motion().u, signals.motion_density * low_pass
+    gain = pass_motion(signals, u, density)
+    removed = u - grid.apply_gain(u, gain)
+    is_whole = _is_noise(signals, removed, density * (1.0 - gain))
+    return replace(signals, motion_pass=gain) if is_whole else signals
+
+
+def _is_noise(signals: LogSignals, values: Float1D, density: Float1D) -> bool:
+    """Return False if a series, (sample,), is louder than noise of a density for a short time.
+
+    A filter of the whole record takes a short event for noise.
+    """
+    grid = signals.grid
+    size = max(round(EVENT_S * grid.rate_hz / grid.decimation), 1)
+    power = density**2
+    share = float(power.sum() ** 2 / max(power.size * (power @ power), 1e-300))
+    freedom = max(size * share, 1.0)
+    local = uniform_filter1d(values**2, size)[signals.good]
+    chance = MAX_EVENT_CHANCE * size / max(local.size, size)
+    expected = (grid.white_noise_rms(density) * math.sqrt(grid.decimation)) ** 2
+    return float(local.max(initial=0.0)) <= chi2.isf(chance, freedom) / freedom * expected
 
 
 def has_single_frequency(signals: LogSignals) -> bool:
