@@ -23,7 +23,7 @@ A, B = BaseKey("a"), BaseKey("b")
 class Toy:
     """What a fit asks of a sheet, for a residual of two numbers."""
 
-    log_number, rows, weight, prior_count = 0, ("only",), 1.0, 0
+    log_number, rows, entry_weight = 0, ("only",), np.ones(COUNT)
 
     def __init__(self, left: Left) -> None:
         self.left = left
