@@ -49,9 +49,8 @@ def test_a_truth_far_from_the_start_is_found_within_its_intervals() -> None:
     for key, value in {**TRUE_BASE, GapKey(0): 4e-4}.items():
         assert within(joint, key, value), key
         size = 2.4e-3 if isinstance(key, GapKey) else value
-        assert 0 < joint.std_errors[key] < 0.03 * size, key
-    expected = identify_wide_gaps().problem.expected_square
-    assert joint.cost == pytest.approx(expected, rel=0.15)
+        assert 0 < joint.std_errors[key] < 0.035 * size, key
+    assert 0.8 < identify_wide_gaps().rms_over_noise < 1.05
 
 
 def test_flight_contacts_and_onsets_agree() -> None:

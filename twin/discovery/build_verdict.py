@@ -414,7 +414,7 @@ def _build_generic_term(general: FittedSet, problem: SelectionProblem) -> Generi
 
 
 def _build_law(proposal: LawProposal, problem: SelectionProblem) -> ProposedLaw:
-    before, after = problem.measure_misfit(proposal.start), problem.measure_misfit(proposal.fitted)
+    before, after = problem.measure_misfit(proposal.start), proposal.misfit
     floor = min(1.0, after)
     fitted = proposal.fitted
     terms = fitted.effects[len(proposal.start.effects) :]

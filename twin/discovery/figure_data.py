@@ -339,15 +339,8 @@ def check_instruments(view: DiscoveryView) -> list[InstrumentGate]:
             before, after = (float(values.mean()) for values in squares)
             quantity = "equal forces" if "cells" in name_of_row else "consistent motion"
             label = f"{name_of_row}: {quantity}"
-            gates.append(
-                InstrumentGate(
-                    name,
-                    label,
-                    before,
-                    after,
-                    before < 1 + MIN_GATE_EXCESS or sigma < MIN_GATE_SIGMA,
-                )
-            )
+            is_healthy = before < 1 + MIN_GATE_EXCESS or sigma < MIN_GATE_SIGMA
+            gates.append(InstrumentGate(name, label, before, after, is_healthy))
         at_rest = residuals.entry_row == len(residuals.rows)
         rest_values = (
             (r * residuals.entry_weight)[at_rest][: len(residuals.rest_channels)] for r in held_out

@@ -39,7 +39,7 @@ FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
 MAX_EXPLAINED_RATIO = 1.05  # of the mean square to the noise: with less no second term is tried
 MIN_FIRST_GAIN = 0.3  # of the excess over the noise: a term that gains less is given no second one
 MIN_CLOSED_SHARE = 0.5  # of the misfit that a law must close to be proposed
-SUFFICIENT_RATIO = 1.1  # of the held-out error to the floor: with less, the law explains the record
+SUFFICIENT_RATIO = 1.1  # times the noise, held out: with less, the law explains the record
 MAX_WORSE_SIGMA = 2.0  # standard errors by which a law with a rounded exponent may be worse
 MAX_WORSE_SHARE = 1e-4  # of the held-out squares, which no one would miss
 
@@ -56,20 +56,15 @@ class LawProposal:
     fitted: FittedSet
     start: FittedSet
     laws: tuple[Effect, ...]
-    floor: float
+    misfit: float  # held out, rms over the noise of the sensors
     nearest: str
     law_class: str
     by_class: tuple[tuple[str, FittedSet], ...]
 
     @property
-    def floor_ratio(self) -> float:
-        """Ratio of the held-out error (rms) to the floor."""
-        return math.sqrt(self.fitted.cost / self.floor)
-
-    @property
     def is_sufficient(self) -> bool:
-        """True if the held-out error is at most `SUFFICIENT_RATIO` of the floor."""
-        return self.floor_ratio <= SUFFICIENT_RATIO
+        """True if the law leaves at most `SUFFICIENT_RATIO` times the noise."""
+        return self.misfit <= SUFFICIENT_RATIO
 
 
 def is_explained(discovery: Discovery) -> bool:
@@ -92,31 +87,20 @@ def propose_law(
     singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     nearest_name = nearest.names[0] if nearest else ""
-    return find_law(discovery.prepared.problem, starts, verdict.floor, nearest_name, report)
-
-
-def find_law(
-    problem: SelectionProblem,
-    starts: Sequence[FittedSet],
-    floor: float,
-    nearest: str = "",
-    report: ProgressCallback = lambda progress: None,
-) -> LawProposal | None:
-    """Return the law that explains most of what the first start leaves; None if none helps.
-
-    `floor` is the mean square over the noise that remains without a misfit.
-    """
-    return select_law(problem, starts, search_laws(problem, starts, report), floor, nearest)
+    problem = discovery.prepared.problem
+    return select_law(problem, starts, search_laws(problem, starts, report), nearest_name)
 
 
 def select_law(
     problem: SelectionProblem,
     starts: Sequence[FittedSet],
     fitted_sets: Sequence[FittedSet],
-    floor: float,
-    nearest: str,
+    nearest: str = "",
 ) -> LawProposal | None:
-    """Return the law of `find_law` among the sets that a search has fitted."""
+    """Return the law, among the sets fitted, that explains most of what the first start leaves.
+
+    None if none helps.
+    """
     if not fitted_sets:
         return None
     best = _round_exponents(problem, _select_simplest(problem, fitted_sets))
@@ -124,15 +108,15 @@ def select_law(
         (start for start in starts if start.effects == best.effects[: len(start.effects)]),
         key=lambda start: len(start.effects),
     )
-    floor = min(floor, best.cost)
-    closed_share = closed_fraction(*map(math.sqrt, (starts[0].cost, best.cost, floor)))
+    before, after = problem.measure_misfit(starts[0]), problem.measure_misfit(best)
+    closed_share = closed_fraction(before, after, min(1.0, after))
     if closed_share < MIN_CLOSED_SHARE or not problem.is_worthwhile(start, best):
         return None
     terms = best.effects[len(start.effects) :]
     laws = tuple(_describe_law(problem, best, term, nearest) for term in terms)
     law_class = find_law_class(terms[0])
     return LawProposal(
-        best, start, laws, floor, nearest, law_class, _list_best_by_class(fitted_sets)
+        best, start, laws, after, nearest, law_class, _list_best_by_class(fitted_sets)
     )
 
 

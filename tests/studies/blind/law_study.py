@@ -37,7 +37,7 @@ from twin.discovery.discover import (
     PreparedProblem,
     prepare_problem,
 )
-from twin.discovery.law_search import LawProposal, find_law
+from twin.discovery.law_search import LawProposal, search_laws, select_law
 from twin.discovery.law_terms import LAW_PREFIX
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet, SelectionProblem
@@ -163,7 +163,7 @@ def find_law_of_base(
     """Return (problem, its base, law) without a search of the library before."""
     problem = prepared.problem
     null = problem.fit_effects(prepared.parameters, ())
-    return problem, null, find_law(problem, [null], problem.noise)
+    return problem, null, select_law(problem, [null], search_laws(problem, [null]))
 
 
 def _describe_terms(law: LawProposal | None) -> list[Json]:
