@@ -294,26 +294,25 @@ def check_level(cycle: DriveCycle) -> Iterator[Suspicion]:
     if not cycle.has(*names) or cycle.level <= 0.0:
         return
     settings, measured = cycle.context.profile.protection, cycle.tones["table_acc_m_s2"].fundamental
-    if swept is not None and cycle.label == Label.MEASURE:
+    if swept is not None:
         rows = np.array([cycle.clean_channel(name) for name in names])
         fits = track_channels(rows, cycle.phase, TRACKED_HARMONICS)
         amplitudes = {name: fit.fundamental for name, fit in zip(names, fits, strict=True)}
         measured = combine_levels(swept, amplitudes, cycle.omega)
     error = measured / cycle.level - 1.0
-    message = f"table at {measured:.4g} m/s2, demanded {cycle.level:.4g} m/s2"
+    subject = "table" if swept is None else "level"
+    message = f"{subject} at {measured:.4g} m/s2, demanded {cycle.level:.4g} m/s2"
     # Before the measured cycles the level may still be converging.
     if abs(error) > settings.alarm and cycle.label == Label.MEASURE:
         limit = math.copysign(settings.alarm, error)
         text = f"{message}: {100 * error:+.1f} %; allowed: +-{100 * settings.alarm:g} %"
-        yield Suspicion(
-            "level", "table_acc_m_s2", measured, (1 + limit) * cycle.level, text, "alarm", 1
-        )
+        yield Suspicion("level", names[0], measured, (1 + limit) * cycle.level, text, "alarm", 1)
     error_db = 20 * math.log10(max(measured / cycle.level, 1e-9))
     if abs(error_db) > settings.abort_db:
         limit = math.copysign(settings.abort_db, error_db)
         text = f"{message}: {error_db:+.1f} dB; allowed: +-{settings.abort_db:g} dB"
         bound = 10 ** (limit / 20) * cycle.level
-        yield Suspicion("level", "table_acc_m_s2", measured, bound, text, "stop")
+        yield Suspicion("level", names[0], measured, bound, text, "stop")
 
 
 def check_command_gain(cycle: DriveCycle) -> Iterator[Suspicion]:

@@ -277,6 +277,21 @@ def test_dead_channel_that_is_not_the_table_aborts() -> None:
     assert_smooth_rest(played)
 
 
+def test_resonance_faster_than_the_compressor_stops_at_the_abort_line() -> None:
+    profile = make_swept_profile(
+        control_channels=["mass_acc_m_s2"],
+        start_hz=0.8,
+        octaves_per_min=6.0,
+        compression=0.02,
+    )
+    played = play_session(profile)
+    (trip,) = played.select(Trip)
+    assert (trip.kind, trip.channel) == ("level", "mass_acc_m_s2")
+    assert_smooth_rest(played)
+    _, mass, _ = measure_cycles(played, "mass_acc_m_s2")
+    assert 1.9 < mass.max() / (0.05 * GRAVITY_M_S2) < 2.6  # within three checks of half a cycle
+
+
 def test_dwell_at_the_resonance_found() -> None:
     played = play_session(
         make_swept_profile(
