@@ -198,3 +198,15 @@ def test_nothing_is_lost_or_doubled_by_twenty_kills(tmp_path: Path) -> None:
     assert [line.number for line in results] == list(range(LOGS_TO_KILL))
     assert [row["log"] for row in read_table(out / "table.csv")] == [line.log for line in results]
     assert 10 < kept < LOGS_TO_KILL
+
+
+def test_fleet_on_a_cluster_has_the_same_table(archive: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    words = ["fleet", "verify", archive, "--out"]
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        there = call_main(*words, tmp_path / "there", "--scheduler", cluster.scheduler_address)
+    assert there.returncode == 4, there.stdout
+    assert call_main(*words, tmp_path / "here").returncode == 4
+    assert read_table(tmp_path / "there/table.csv") == read_table(tmp_path / "here/table.csv")
