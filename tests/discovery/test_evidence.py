@@ -7,9 +7,12 @@ import pytest
 
 from table_io.block import Float2D
 from tests.discovery.played import SNM, log
+from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import prepare_problem
-from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence
+from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, build_evidence
+from twin.discovery.parameters import ParameterSet
+from twin.discovery.residuals import LogResiduals
 from twin.discovery.screening import Variant
 
 ENTRIES, FORCE = 400, 100.0
@@ -74,3 +77,19 @@ def test_a_column_that_is_noise_explains_nothing() -> None:
     column = np.array([noise])
     linear = build(column, -0.5 * noise, noise=np.array([[noise @ noise * (1 - 1e-6)]]))
     assert linear.measure_set([0]) < 1.0
+
+
+def test_a_place_that_only_noise_reaches_is_no_unknown_force(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of two columns one is empty in the readings, but not in their copy with more noise."""
+
+    def compute_forces(residuals: LogResiduals, parameters: ParameterSet) -> dict[str, list]:
+        size = residuals.motion().u.size
+        is_copy = residuals.fixed_noise is not None
+        return {"here": [np.full((3, size), float(is_copy)), np.ones((3, size))]}
+
+    monkeypatch.setattr(evidence, "compute_stranger_forces", compute_forces)
+    prepared = prepare_problem([log()], SNM)
+    linear = build_evidence(prepared.problem.log_residuals, prepared.parameters, (), {})
+    assert linear.places["here"].size == 1

@@ -310,11 +310,10 @@ def _list_strangers(
     columns: list[Float1D] = []
     places: dict[str, Int1D] = {}
     for place, parts in entries.items():
+        # those without an entry too: a copy of the noise must have the same columns
         own = [np.concatenate(part) for part in parts]
-        own = [column for column in own if column @ column > 0]
-        if own:
-            places[place] = first + len(columns) + np.arange(len(own))
-            columns += own
+        places[place] = first + len(columns) + np.arange(len(own))
+        columns += own
     return places, columns
 
 
@@ -346,7 +345,8 @@ def _absorb_base(
     scale = np.sqrt(np.einsum("ij,ij->i", columns, columns))
     scale[-1] = 1.0
     columns = columns / np.maximum(scale, 1e-300)[:, None]
-    noise = noise / np.maximum(np.outer(scale, scale), 1e-300)
+    sizes = np.outer(scale, scale)
+    noise = np.divide(noise, sizes, out=np.zeros_like(noise), where=sizes > 0)
     gram = columns @ columns.T - noise
     u, s, _ = np.linalg.svd(gram[:base, :base], hermitian=True)
     kept = s > MIN_BASE_SHARE * max(float(s.max(initial=0.0)), 1e-300)
