@@ -38,6 +38,7 @@ STRANGER_SHARES = (0.003, 0.01, 0.03, 0.1)  # the same for the stranger, each as
 SET_PRIORS = (0.5, 0.3, 0.15, 0.05)
 STRANGER_PRIOR = 0.2
 PAIR_STARTS, TRIPLE_STARTS, STRANGER_STARTS = 40, 12, 12  # sets that are extended
+RICHEST_EFFECTS = 3  # beside the stranger, in the model that shows the noise
 MIN_BASE_SHARE = 1e-12  # of the curvature of the base: directions with less are left out
 MIN_INFORMATION_SHARE = 1e-9  # of a column's norm: with less left, other parameters imitate it
 
@@ -398,15 +399,22 @@ def _measure_inflation(
 ) -> tuple[float, float]:
     """Return (variance inflation of scores, level) of what the richest model leaves.
 
-    That model has the stranger at every place, the columns `rich`, and the column itself: what is
-    left scatters between the units (steps) more than its samples say where these are correlated.
+    That model has the stranger at every place, the columns `rich`, and the candidates that explain
+    most beside them, because no smooth force has the jump of a friction: what is left scatters
+    between the units (steps) more than its samples say where these are correlated.
     """
-    chosen = rest[[*rich, *range(count, len(rest))]]
-    chosen = chosen[np.einsum("ij,ij->i", chosen, chosen) > MIN_INFORMATION_SHARE]
-    left = r
-    if len(chosen):
-        solution = np.linalg.lstsq(chosen @ chosen.T, chosen @ r, rcond=1e-8)[0]
-        left = r - solution @ chosen
+    chosen = [*rich, *range(count, len(rest))]
+    for _ in range(RICHEST_EFFECTS + 1):
+        basis = rest[chosen]
+        gram = basis @ basis.T
+        solution = np.linalg.lstsq(gram, basis @ np.column_stack([r, rest[:count].T]), rcond=1e-8)[
+            0
+        ]
+        left = r - solution[:, 0] @ basis
+        others = rest[:count] - solution[:, 1:].T @ basis
+        square = np.einsum("ij,ij->i", others, others)
+        gain = np.where(square > MIN_INFORMATION_SHARE, (others @ left) ** 2, 0.0)
+        chosen += np.argsort(-gain / np.maximum(square, MIN_INFORMATION_SHARE))[:1].tolist()
     level = float(np.mean(left**2 / expected))
     ratios = []
     units = int(unit.max(initial=0)) + 1
