@@ -235,7 +235,7 @@ class _SheetWriter:
         self._number += 1
         figure = Figure(figsize=PAGE_IN)
         figure.set_layout_engine("none")
-        figure.text(MARGIN, 0.04, self._title, size=7, color="#666666")
+        figure.text(MARGIN, 0.04, self._title, size=7, color="#666666", parse_math=False)
         figure.text(1 - MARGIN, 0.04, f"{self._number}", size=7, ha="right", color="#666666")
         self._y = 1.0 - MARGIN
         return figure
@@ -253,7 +253,9 @@ class _SheetWriter:
             self._figure = self._open()
 
     def _write(self, text: str, x: float = 0.0, size: float = 8.5, weight: str = "normal") -> None:
-        self._figure.text(MARGIN + x, self._y, text, size=size, weight=weight, va="top")
+        self._figure.text(
+            MARGIN + x, self._y, text, size=size, weight=weight, va="top", parse_math=False
+        )
 
     def write_cover(self, report: CustomerReport) -> None:
         """Write the title page."""
