@@ -6,6 +6,7 @@ import pytest
 
 from tests.command_line import call_main
 from tests.setup.test_swept_prediction import PROFILE
+from twin.archive.query import index_runs
 from twin.inspection.folder_report import write_folder_report
 from twin.recording.reader import read_recording
 from twin.report.customer_report import build_customer_report
@@ -14,10 +15,11 @@ from twin.report.report import load_report_data
 TEXTS = """
 [customer]
 laboratory = "Shake & Co"
+order = "$x_{$"
 specimen = "Valve <7>"
 signatures = ["A. Engineer"]
 """
-WIDE = 'limits = [{ channel = "mass_acc_m_s2", limit = 0.3, action = "stop" }]'
+WIDE = 'limits = [{ channel = "mass_acc_m_s2", limit = 1.2, action = "stop" }]'
 
 
 @pytest.fixture(scope="module")
@@ -37,12 +39,26 @@ def test_customer_report_states_texts_limits_and_the_stop(folder: Path) -> None:
     assert cover["Laboratory"] == "Shake & Co"
     assert len(cover["Recording, SHA-256"]) == 64
     sections = {section.title: section for section in report.sections}
-    assert ("Limit of mass_acc_m_s2", "0.3 SI: stop") in sections["Set-up"].rows
+    assert ("Limit of mass_acc_m_s2", "1.2 SI: stop") in sections["Set-up"].rows
     assert [row[0] for row in sections["Instruments"].rows][:2] == ["drive_disp_m", "table_disp_m"]
     deviations = " ".join(sections["Deviations"].lines)
     assert "The test was aborted" in deviations
     assert "exceeds the limit of the test" in deviations
     assert report.signatures == ("A. Engineer",)
+
+
+def test_sweep_that_was_stopped_is_no_whole_pass_on_any_surface(folder: Path) -> None:
+    summary = load_report_data(folder, read_recording(folder / "run.mcap")).summary
+    assert summary.swept_sine is not None
+    assert summary.excitation_verdict is not None
+    planned = summary.swept_sine.planned_passes
+    assert summary.swept_sine.passes == planned - 1
+    assert summary.excitation_verdict.verdict == "missed"
+    assert f"{planned - 1} of {planned} passes" in summary.excitation_verdict.reason
+    ends = summary.swept_sine.highest_ratio - 1.0, summary.swept_sine.lowest_ratio - 1.0
+    assert summary.excitation_verdict.worst_error == max(ends, key=abs)
+    (row,) = index_runs(folder.parent)
+    assert row.level_g == pytest.approx(0.05)
 
 
 def test_customer_report_is_a_page_and_a_pdf(folder: Path) -> None:

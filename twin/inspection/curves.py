@@ -43,7 +43,7 @@ def read_curves(log: str | Path) -> RecordedCurves:
     recording = open_recording(log)
     if not recording.start.steps:
         raise InputError(
-            "a displacement history has no curves over frequency",
+            "a test without steps has no curves over frequency",
             where=recording.path,
             allowed="recordings of a stepped sine",
             remedy="see the windows in summary.json, or in report.html by `shaketwin report`",

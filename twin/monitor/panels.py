@@ -263,7 +263,7 @@ def draw_prc(view: RunView, width: int, height: int, value: ResponseQuantity = e
     plot = view.plot(value)
     if plot.range_hz is None:
         is_known = view.run_state.start is not None
-        text = "a displacement history has no curves over frequency"
+        text = "a test without steps has no curves over frequency"
         return [Text(text if is_known else "waiting for the test plan", DIM_STYLE)]
     y_max = nice_ceil(plot.highest or 1.0)
     curves = [

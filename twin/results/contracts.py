@@ -412,6 +412,11 @@ class ResonanceEntry(Contract):
     amplification: RealRatio = Field(description="fundamental of the response over the level")
 
 
+def select_judged_points(points: list[SweptPoint]) -> list[SweptPoint]:
+    """Return the points where the level is judged: at the first frequency it is still being set."""
+    return [point for point in points if point.frequency_hz != points[0].frequency_hz]
+
+
 class SweptSineResult(Contract):
     """Swept sine: the level against its tolerance over frequency, and what was found."""
 
@@ -420,7 +425,7 @@ class SweptSineResult(Contract):
     strategy: str = Field(description="of several control channels: average or maximum")
     tolerance: RealRatio = Field(description="of the demanded level, on either side")
     abort_db: RealSI = Field(description="deviation at which the table stops")
-    passes: int = Field(description="passes that were begun")
+    passes: int = Field(description="passes that were played to their end")
     planned_passes: int = Field(description="passes of the profile")
     inside: RealRatio = Field(description="share of the time within the tolerance")
     highest_ratio: RealRatio = Field(description="achieved over demanded, largest")

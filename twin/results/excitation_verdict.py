@@ -17,6 +17,7 @@ from twin.results.contracts import (
     StepEntry,
     SweptSineResult,
     TrackingResult,
+    select_judged_points,
 )
 
 # Of the rms of the target's acceleration, in the band that is judged: beyond it the table has
@@ -35,6 +36,8 @@ def judge_excitation(summary: RunSummary, profile: Profile) -> ExcitationVerdict
         return _judge_record(summary.tracking, profile)
     if summary.swept_sine is not None:
         return _judge_swept_sine(summary.swept_sine)
+    if profile.swept_sine is not None:
+        return _decline("the test ended before its frequency moved")
     known = list_level_errors(summary.steps)
     if not known:
         return _decline("the level of no step is known")
@@ -58,8 +61,7 @@ def _judge_swept_sine(swept: SweptSineResult) -> ExcitationVerdict:
     """Return the verdict on a swept sine: all passes played, and the level held for the time."""
     errors = [
         (point.achieved_m_s2 / point.demanded_m_s2 - 1.0, point)
-        for point in swept.points
-        if point.direction != "dwell"
+        for point in select_judged_points(swept.points)
     ]
     outside = sum(abs(error) > swept.tolerance for error, _ in errors)
     error, worst = max(errors, key=lambda entry: abs(entry[0]))

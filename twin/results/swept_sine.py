@@ -9,7 +9,12 @@ from table_io.config.profile import Profile
 from table_io.control.sweep_control import find_pass_resonances
 from table_io.records import SweepLevel
 from twin.recording.reader import Recording
-from twin.results.contracts import ResonanceEntry, SweptPoint, SweptSineResult
+from twin.results.contracts import (
+    ResonanceEntry,
+    SweptPoint,
+    SweptSineResult,
+    select_judged_points,
+)
 
 
 def summarise_swept_sine(
@@ -22,9 +27,11 @@ def summarise_swept_sine(
     """
     levels = recording.records(SweepLevel)
     points = [_describe_point(level, config, recording.start.rate_hz) for level in levels]
-    swept = [point for point in points if point.frequency_hz != points[0].frequency_hz]
+    swept = select_judged_points(points)
     if not swept:
         return None
+    is_complete = recording.stop is not None and recording.stop.verdict == "complete"
+    last = max(point.sweep for point in swept)
     tolerance = profile.protection.alarm
     ratios = np.array([point.achieved_m_s2 / point.demanded_m_s2 for point in swept])
     ends = np.array([points[0].at_s, *(point.at_s for point in swept)])
@@ -37,7 +44,7 @@ def summarise_swept_sine(
         strategy=config.strategy,
         tolerance=tolerance,
         abort_db=profile.protection.abort_db,
-        passes=1 + max(min(point.sweep, config.passes - 1) for point in swept),
+        passes=config.passes if is_complete else min(last, config.passes),
         planned_passes=config.passes,
         inside=float(seconds[np.abs(ratios - 1.0) <= tolerance].sum() / seconds.sum()),
         highest_ratio=float(ratios.max()),
