@@ -129,6 +129,15 @@ def test_only_what_changed_is_read_again(archive: Path, monkeypatch: pytest.Monk
     assert after.runs[2].values == before.runs[2].values
 
 
+def test_a_recording_that_is_cut_off_is_a_problem(archive: Path) -> None:
+    """The start can still be read of it, and the summary states a whole run."""
+    log = archive / "run0/run.mcap"
+    log.write_bytes(log.read_bytes()[:-1])
+    rows = {Path(row.folder).name: row for row in index_runs(archive)}
+    assert "cut off" in str(rows["run0"].problem)
+    assert (rows["run0"].verdict, rows["run2"].problem) == ("complete", None)
+
+
 def damage(archive: Path) -> None:
     """Damage each of four runs in another way."""
     (archive / "run0/summary.json").write_text('{"verdict": 3')
@@ -199,7 +208,8 @@ def test_faulty_expressions_get_one_error(archive: Path, expression: str, key: s
 
 @pytest.mark.parametrize(
     "expression",
-    ["gapmm = 4", "gap_mm = ", "gap_mm = 4; DROP TABLE runs",
+    ["gapmm = 4", "gap_mm = ", "", " ", "gap_mm = 4; DROP TABLE runs",
+     "1 = 1); SELECT 99 AS number WHERE (1 = 1",
      "(SELECT count(*) FROM read_text('/etc/hostname')) = 1"],
 )  # fmt: skip
 def test_sql_that_is_no_expression_over_the_columns_is_refused(
@@ -232,6 +242,8 @@ def test_notes_stand_beside_what_was_recorded(archive: Path) -> None:
     assert {name: (run / name).read_bytes() for name in recorded} == recorded
     with raises_input_error(where=run, key="--untag"):
         note_run(run, untag=("a",))
+    with raises_input_error(where=run, key="--tag"):
+        note_run(run, tags=("",))
     with raises_input_error(where=archive):
         note_run(archive, "no run here")
 

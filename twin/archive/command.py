@@ -62,6 +62,9 @@ def print_runs(
         return
     if rows:
         print_table(console, _make_table(rows))
+        faulty = sum(row.problem is not None for row in rows)
+        if faulty:
+            print_line(f"{faulty} with a problem; --json states them")
     elif where is not None:
         print_line(f"no run in {folder.resolve()} meets --where {where}")
     else:

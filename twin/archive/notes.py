@@ -48,6 +48,8 @@ def note_run(
     """
     if not ((folder / "run.mcap").exists() or (folder / PARTS_FOLDER).is_dir()):
         raise InputError("no run in this folder", where=folder, remedy="give the folder of a run")
+    if not all(tag.strip() for tag in tags):
+        raise InputError("an empty tag", where=folder, key="--tag", remedy="give it a text")
     before = read_notes(folder)
     for tag in untag:
         if tag not in before.tags:

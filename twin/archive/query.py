@@ -69,10 +69,11 @@ def _select_rows(
         relation.to_table("runs")
     database.execute("SET enable_external_access = false")  # the expression reads no other file
     try:
-        numbers = database.execute(
-            f"SELECT number FROM (SELECT *, row_number() OVER () - 1 AS number FROM runs) "
-            f"WHERE ({where}\n)"
-        ).fetchall()
+        if not where.strip():
+            raise duckdb.Error("an empty expression")
+        numbered = database.sql("SELECT *, row_number() OVER () - 1 AS number FROM runs")
+        # As a filter, so that it is one expression, and no further statements.
+        numbers = numbered.filter(f"({where}\n)").project("number").fetchall()
     except duckdb.Error as error:
         raise InputError(
             " ".join(str(error).split("\n\n", maxsplit=1)[0].split()),

@@ -15,6 +15,7 @@ from twin.archive.notes import NOTES_FILE, read_notes
 from twin.archive.run_row import Row, RunRow
 from twin.model.config import ModelConfig
 from twin.recording.reader import read_start
+from twin.recording.recovery import ends_whole
 from twin.recording.run_paths import explain_unmerged_parts
 from twin.results.contracts import ChannelError, Response, RunSummary, StepEntry
 from twin.results.summary import parse_toml_tables
@@ -64,6 +65,8 @@ def _add_start(row: RunRow, folder: Path, problems: list[str]) -> RunRow:
     except (InputError, OSError) as error:
         problems.append(f"no start of the recording: {error}")
         return row
+    if not ends_whole(folder / "run.mcap"):
+        problems.append("run.mcap is cut off: `shaketwin verify` lists what is lost")
     try:
         parameters = _list_model_values(start.model_toml, start.profile_toml)
     except InputError as error:
@@ -146,6 +149,7 @@ def _add_summary(row: RunRow, folder: Path, problems: list[str]) -> tuple[RunRow
         trips=len(summary.trips),
         u_star_m=summary.u_star_m,
         a_star_m_s2=summary.a_star_m_s2,
+        level_g=_find_level_g(summary) or row.level_g,
         nrmse=summary.comparison.get("rel_disp_m", ChannelError()).nrmse,
         values=dict(row.values or {}) | _list_estimates(summary) | _list_errors(summary),
     )
@@ -168,6 +172,14 @@ def _add_summary(row: RunRow, folder: Path, problems: list[str]) -> tuple[RunRow
             excitation_error=excitation.worst_error,
         )
     return row, [_make_step_row(row, step) for step in summary.steps]
+
+
+def _find_level_g(summary: RunSummary) -> float | None:
+    """Return the largest level of a swept sine in g; None for other tests."""
+    if summary.swept_sine is None:
+        return None
+    levels = [point.reference_m_s2 for point in summary.swept_sine.points]
+    return round(max(levels) / GRAVITY_M_S2, 9)
 
 
 def _list_estimates(summary: RunSummary) -> dict[str, float | None]:

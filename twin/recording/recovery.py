@@ -55,6 +55,13 @@ DEFAULT_MEMORY_BYTES = 4 * 2**30
 UINT32, UINT64 = struct.Struct("<I"), struct.Struct("<Q")
 
 
+def ends_whole(path: Path) -> bool:
+    """Return whether a recording has the end that is written when it is closed."""
+    with path.open("rb") as file:
+        file.seek(max(path.stat().st_size - len(MAGIC), 0))
+        return file.read() == MAGIC
+
+
 class InvalidRecordError(ValueError):
     """Bytes that are not a valid MCAP record."""
 
