@@ -135,6 +135,9 @@ def _make_fault(model: type[ConfigModel], error: Any, raw: Any) -> InputError:
         return InputError("unknown key", key=key, remedy=suggest(str(location[-1]), known))
     if error["type"] == "missing":
         return InputError("missing", key=key, remedy="add it")
+    if error["type"] in ("tuple_type", "list_type") and isinstance(error["input"], Mapping):
+        remedy = f"write [[{key}]] above each of them"
+        return InputError("one table", key=key, allowed="a list of tables", remedy=remedy)
     if error["type"] != "value_error":
         message = str(error["msg"])
         return InputError(f"{message[0].lower()}{message[1:]}", key=key, value=error["input"])

@@ -54,7 +54,7 @@ from table_io.sequencer.orbits import (
 from table_io.sequencer.state import SequencerState, Stage, TestPlan
 from table_io.sequencer.swept_sine import (
     begin_swept_sine,
-    check_control_channels,
+    check_swept_channels,
     decide_sweep_level,
 )
 
@@ -323,7 +323,7 @@ def make_test_plan(profile: Profile, rig: RigConfig, replace_after: int = 0) -> 
     feedback_horizon = replace_after + math.ceil(FEEDBACK_HORIZON_S * rate)
     check_limited_channels(profile.limits, rig)
     if profile.swept_sine is not None:
-        check_control_channels(profile.swept_sine, rig)
+        check_swept_channels(profile.swept_sine, rig)
     if profile.continuation is not None:
         _check_horizon(profile.continuation, rig, feedback_horizon / rate)
         _check_sensors(rig)

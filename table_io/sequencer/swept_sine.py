@@ -55,13 +55,16 @@ KNOWN_SPAN = 0.3  # in ln f, of what an earlier pass says about the next part
 NOTCHED_SHARE = 0.998  # of the level of the profile: below it is reduced by a limit
 
 
-def check_control_channels(config: SweptSine, rig: RigConfig) -> None:
-    """Raise InputError if the rig does not measure a channel of the level."""
-    for name in config.control_channels:
+def check_swept_channels(config: SweptSine, rig: RigConfig) -> None:
+    """Raise InputError if the rig does not measure a channel of the level or of the resonances."""
+    wanted = [("control_channels", name) for name in config.control_channels]
+    if config.dwell_s or "response_channel" in config.model_fields_set:
+        wanted.append(("response_channel", config.response_channel))
+    for key, name in wanted:
         if name not in rig.channels:
             raise InputError(
                 f"rig {rig.name!r} does not measure this channel",
-                key="excitation.control_channels",
+                key=f"excitation.{key}",
                 value=name,
                 allowed=", ".join(rig.channels),
             )

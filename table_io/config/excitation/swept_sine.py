@@ -38,6 +38,7 @@ CONTROL_UNITS = ("_m_s2", "_m")  # ends of the names of channels that measure a 
 MIN_SAMPLES_PER_CYCLE = 20.0  # at the highest frequency
 WINDOWS_PER_OCTAVE = 3  # parts of a pass, for the results
 MAX_DWELLS = 4
+MAX_PASSES_H = 24.0  # of all passes: the plan of a test is held in memory
 UPDATE_CYCLES, MIN_UPDATE_S = 1.0, 0.1  # between two corrections of the level
 TRACKED_CYCLES, MIN_TRACKED_S = 2.0, 0.1  # from which a level is measured
 
@@ -55,7 +56,9 @@ class SweptSine(Excitation):
     directions: tuple[Literal["forward", "backward"], ...] = Field(
         ("forward", "backward"), min_length=1, max_length=2, description="Order of the passes."
     )
-    repeats: Count = Field(1, ge=1, le=100, description="Of all passes, one after another.")
+    repeats: Count = Field(
+        1, ge=1, le=100, validate_default=True, description="Of all passes, one after another."
+    )
     acceleration_g: Positive = Field(0.05, description="Level: peak acceleration.")
     displacement_mm: Positive | None = Field(
         None, description="Largest displacement amplitude: it sets the level below the crossover."
@@ -107,6 +110,22 @@ class SweptSine(Excitation):
                 remedy="give the band in ascending order and the passes in `directions`",
             )
         return stop
+
+    @field_validator("repeats")
+    @classmethod
+    def _check_duration(cls, repeats: int, info: ValidationInfo) -> int:
+        keys = "start_hz", "stop_hz", "octaves_per_min", "directions"
+        if not info.data.keys() >= {*keys}:
+            return repeats
+        start, stop, rate, directions = (info.data[key] for key in keys)
+        hours = repeats * len(directions) * math.log2(stop / start) / rate / 60.0
+        if hours > MAX_PASSES_H:
+            raise InputError(
+                f"the passes take {hours:.4g} h",
+                allowed=f"at most {MAX_PASSES_H:g} h",
+                remedy="raise octaves_per_min, or divide the test into several",
+            )
+        return repeats
 
     @field_validator("level_points")
     @classmethod

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Float1D, Label
+from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import Event, SweepLevel, Trip
@@ -328,5 +329,11 @@ def test_refusals_of_a_swept_sine_name_the_key() -> None:
         )
     with pytest.raises(InputError, match="control_channels"):
         make_test_plan(make_swept_profile(control_channels=["specimen_acc_top_m_s2"]), rig)
+    with pytest.raises(InputError, match="response_channel"):
+        make_test_plan(make_swept_profile(response_channel="mass_acc_m_s"), rig)
+    with pytest.raises(ValueError, match=r"the passes take .* h"):
+        make_swept_profile(octaves_per_min=1e-6)
+    with pytest.raises(InputError, match=r"write \[\[limits\]\]"):
+        parse_toml('[limits]\nchannel = "table_acc_m_s2"\nlimit = 1.0', Profile, "test")
     with pytest.raises(InputError, match="samples per cycle"):
         _ = make_swept_profile(stop_hz=100.0).plan
