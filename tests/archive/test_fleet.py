@@ -206,7 +206,7 @@ def test_fleet_on_a_cluster_has_the_same_table(archive: Path, tmp_path: Path) ->
     with distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
     ) as cluster:
-        there = call_main(*words, tmp_path / "there", "--scheduler", cluster.scheduler_address)
-    assert there.returncode == 4, there.stdout
+        remote = call_main(*words, tmp_path / "there", "--scheduler", cluster.scheduler_address)
+    assert remote.returncode == 4, remote.stdout
     assert call_main(*words, tmp_path / "here").returncode == 4
     assert read_table(tmp_path / "there/table.csv") == read_table(tmp_path / "here/table.csv")
