@@ -40,6 +40,7 @@ def test_customer_report_states_texts_limits_and_the_stop(folder: Path) -> None:
     assert len(cover["Recording, SHA-256"]) == 64
     sections = {section.title: section for section in report.sections}
     assert ("Limit of mass_acc_m_s2", "1.2 SI: stop") in sections["Set-up"].rows
+    assert ("Excitation, directions", "forward") in sections["Set-up"].rows
     assert [row[0] for row in sections["Instruments"].rows][:2] == ["drive_disp_m", "table_disp_m"]
     deviations = " ".join(sections["Deviations"].lines)
     assert "The test was aborted" in deviations

@@ -101,7 +101,7 @@ def _list_set_up(run: ReportData, profile: Profile) -> Rows:
         ("Moving mass of the specimen", f"{profile.specimen.mass_kg:g} kg"),
         ("Gap of the bumpers, right and left", gaps),
         ("Sampling", f"{profile.acquisition.rate_hz:g} Hz"),
-        *((f"Excitation, {name}", f"{value}") for name, value in excitation.items()),
+        *((f"Excitation, {name}", _format_value(value)) for name, value in excitation.items()),
         ("Alarm and stop of the level",
          f"+-{100 * profile.protection.alarm:g} %, +-{profile.protection.abort_db:g} dB"),
     ]  # fmt: skip
@@ -110,6 +110,10 @@ def _list_set_up(run: ReportData, profile: Profile) -> Rows:
         for entry in profile.limits
     ]
     return [*rows, *([("Notes", profile.notes)] if profile.notes else [])]
+
+
+def _format_value(value: object) -> str:
+    return ", ".join(map(_format_value, value)) if isinstance(value, tuple | list) else f"{value}"
 
 
 def _list_instruments(run: ReportData) -> Rows:
