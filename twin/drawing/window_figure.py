@@ -78,7 +78,7 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
         "after an impact in a chaotic motion it cannot be reproduced sample by sample. Residual: "
         "measured minus twin. Bands: windows."
     )
-    yield CaptionedFigure("history", "Response to the displacement history", caption, figure)
+    yield CaptionedFigure("history", "Response over time", caption, figure)
 
 
 def _join(
