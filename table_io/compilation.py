@@ -2,6 +2,7 @@
 
 import hashlib
 import inspect
+import os
 import pickle
 import platform
 import tempfile
@@ -206,7 +207,8 @@ class _KernelCache:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
-        self.cache_path = numba.config.CACHE_DIR
+        # not what numba knows of it, which may have been imported before
+        self.cache_path = os.environ["NUMBA_CACHE_DIR"]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled function for a signature, None if it has to be compiled."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 from numba import float64
@@ -113,6 +112,21 @@ def test_kernel_follows_a_function_in_another_file(tmp_path: Path) -> None:
     assert run_kernel(copy, cache) == [str(total), "1"], "not found from another copy"
 
 
+def test_compiled_kernels_go_to_the_cache_of_the_user_after_an_import_of_numba(
+    tmp_path: Path,
+) -> None:
+    write_package(tmp_path, "plant_laws")
+    folder, cache = tmp_path / "folder", tmp_path / "cache"
+    folder.mkdir()
+    env = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"}
+    path = f"{Path(__file__).parents[2]}{os.pathsep}{tmp_path}"
+    command = [sys.executable, "-B", "-c", f"import numba\n{RUN_KERNEL}"]
+    env |= {"PYTHONPATH": path, "XDG_CACHE_HOME": str(cache)}
+    subprocess.run(command, check=True, cwd=folder, env=env)
+    assert not [*folder.iterdir()]
+    assert [*cache.rglob("*.kernel")]
+
+
 def test_signatures_do_not_share_what_was_compiled(import_package: Any) -> None:
     total = sum(VALUES.values())
     for hits in (0, 1):
@@ -125,7 +139,7 @@ def test_signatures_do_not_share_what_was_compiled(import_package: Any) -> None:
 def import_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that imports the package with these values, each time under a new name."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
 
     def import_changed(**changed: float) -> ModuleType:
         for name in [name for name in sys.modules if name.partition(".")[0] == "laws_package"]:
@@ -235,7 +249,7 @@ def test_kernels_name_all_modules_that_they_are_made_of() -> None:
 def test_cache_that_cannot_be_written_costs_only_time(
     folder: str, import_package: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(numba.config, "CACHE_DIR", folder)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", folder)
     assert import_package().kernel(1.0) == sum(VALUES.values())
 
 
