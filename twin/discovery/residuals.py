@@ -888,16 +888,18 @@ class LogResiduals:
 
 
 def measure_level(
-    log_residuals: Sequence[LogResiduals], entries: Sequence[Float1D], moving_only: bool = False
+    log_residuals: Sequence[LogResiduals], entries: Sequence[Float1D], forces_only: bool = False
 ) -> float:
     """Return the mean of the squares of entries over what noise and unknown errors alone leave.
 
-    `entries`, (entry,) per log, are residuals; at rest no force of a model acts.
+    `entries`, (entry,) per log, are residuals. `forces_only` leaves out those in which no force of
+    a model acts: at rest, and where sensors are compared.
     """
     ratios = []
     for residuals, values in zip(log_residuals, entries, strict=True):
         ratio = values**2 / residuals.expected_entries
-        ratios.append(ratio[residuals.entry_row < len(residuals.rows)] if moving_only else ratio)
+        of_forces = [name in (*FORCE_ROWS, *PULL_ROWS) for name in (*residuals.rows, "rest")]
+        ratios.append(ratio[np.array(of_forces)[residuals.entry_row]] if forces_only else ratio)
     return float(np.concatenate(ratios).mean())
 
 

@@ -149,11 +149,11 @@ class SelectionProblem:
         return self.measure_misfit(replace(fitted, fit=replace(fitted.fit, held_out=entries)))
 
     def measure_level(self, fitted: FittedSet) -> float:
-        """Return the level of the residual in motion; 1 if it is noise and unknown errors."""
-        return measure_level(self.log_residuals, fitted.held_out, moving_only=True)
+        """Return the level of the forces left; 1 if they are noise and unknown errors."""
+        return measure_level(self.log_residuals, fitted.held_out, forces_only=True)
 
     def measure_noise(self, fitted: FittedSet) -> float:
-        """Return the level in motion that the noise of the readings leaves of a model.
+        """Return the level of forces that the noise of the readings leaves of a model.
 
         It is that of the model itself: where a law is steep, as friction at the reversal of a
         motion, the noise of the motion is louder than in any other model.
@@ -163,7 +163,7 @@ class SelectionProblem:
             each.noise_copy.evaluate(parameters) - each.evaluate(parameters)
             for each in self.log_residuals
         ]
-        return measure_level(self.log_residuals, noise, moving_only=True)
+        return measure_level(self.log_residuals, noise, forces_only=True)
 
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""
