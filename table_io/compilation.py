@@ -2,7 +2,6 @@
 
 import hashlib
 import inspect
-import os
 import pickle
 import platform
 import tempfile
@@ -207,8 +206,7 @@ class _KernelCache:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
-        # not what numba knows of it, which may have been imported before
-        self.cache_path = os.environ["NUMBA_CACHE_DIR"]
+        self.cache_path = numba.config.CACHE_DIR
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the compiled function for a signature, None if it has to be compiled."""

@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from numba import float64
@@ -139,7 +140,7 @@ def test_signatures_do_not_share_what_was_compiled(import_package: Any) -> None:
 def import_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that imports the package with these values, each time under a new name."""
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
 
     def import_changed(**changed: float) -> ModuleType:
         for name in [name for name in sys.modules if name.partition(".")[0] == "laws_package"]:
@@ -249,7 +250,7 @@ def test_kernels_name_all_modules_that_they_are_made_of() -> None:
 def test_cache_that_cannot_be_written_costs_only_time(
     folder: str, import_package: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", folder)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", folder)
     assert import_package().kernel(1.0) == sum(VALUES.values())
 
 
