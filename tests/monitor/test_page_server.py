@@ -2,6 +2,7 @@
 
 import http.client
 import json
+import logging
 import re
 import socket
 import ssl
@@ -326,6 +327,7 @@ def test_silent_connections_shut_nobody_out(page: Served) -> None:
 def test_wrong_code_is_logged_and_slowed_and_a_right_one_is_not(
     lab: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    caplog.set_level(logging.WARNING, page_server.log.name)
     monkeypatch.setattr(page_server, "WRONG_CODE_S", 0.4)
     with serving(own(lab, "anna")) as page, ThreadPoolExecutor(3) as threads:
         started_s = time.monotonic()

@@ -553,7 +553,7 @@ def test_motion_keys() -> None:
         steps, cycles = np.full(labels.size, step), np.full(labels.size, -1)
         values = np.zeros((CHANNEL_COUNT, labels.size))
         block = Block("meas", 0, 2000.0, RIG.channels, values, steps, labels, cycles)
-        keys = protection._motion_keys(block).tolist()
+        keys = protection._motion_keys(block, is_swept=False).tolist()
         for label, key, is_history in zip(Label, keys, block.is_history, strict=True):
             if label == Label.REST:
                 assert key == 0
