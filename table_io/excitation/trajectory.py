@@ -75,22 +75,8 @@ class Trajectory:
         mean_hz = 0.5 * (start.frequency_hz + target.frequency_hz)
         duration_s = max(RAMP_CYCLES / mean_hz, RAMP_S) if from_rest else min_cycles / mean_hz
         while True:
-            segment = Segment(
-                self.end,
-                math.ceil(duration_s * self.rate_hz),
-                label,
-                step,
-                start.frequency_hz,
-                target.frequency_hz,
-                start.level_m_s2,
-                target.level_m_s2,
-                self.phase,
-                correction0=start.correction,
-                correction1=target.correction,
-                shape0=start.shape,
-                shape1=target.shape,
-                rate0=self.log_rate_1_s,
-            )
+            count = math.ceil(duration_s * self.rate_hz)
+            segment = self._make_segment(start, target, count, step, label)
             if peak_acceleration_ratio(segment, self.rate_hz) <= PEAK_RATIO:
                 return self._append(segment, target)
             duration_s += 0.25 / mean_hz
@@ -99,23 +85,8 @@ class Trajectory:
         self, target: SineTarget, count: int, step: int, log_rate_1_s: float, label: Label
     ) -> "Trajectory":
         """Append `count` samples of a swept sine that end at `target` with this slope of ln f."""
-        start = self.target
-        segment = Segment(
-            self.end,
-            count,
-            label,
-            step,
-            start.frequency_hz,
-            target.frequency_hz,
-            start.level_m_s2,
-            target.level_m_s2,
-            self.phase,
-            correction0=start.correction,
-            correction1=target.correction,
-            rate0=self.log_rate_1_s,
-            rate1=log_rate_1_s,
-        )
-        return self._append(segment, target)
+        segment = self._make_segment(self.target, target, count, step, label)
+        return self._append(replace(segment, rate1=log_rate_1_s), target)
 
     def append_hold(
         self, count: int, step: int, label: Label, cycles: int = 0, settle: int = 0
@@ -179,6 +150,27 @@ class Trajectory:
             else self
         )
         return Drive(self.rate_hz, trajectory.segments, steps)
+
+    def _make_segment(
+        self, start: SineTarget, target: SineTarget, count: int, step: int, label: Label
+    ) -> Segment:
+        """Return the segment of `count` samples that leads from one motion to another from here."""
+        return Segment(
+            self.end,
+            count,
+            label,
+            step,
+            start.frequency_hz,
+            target.frequency_hz,
+            start.level_m_s2,
+            target.level_m_s2,
+            self.phase,
+            correction0=start.correction,
+            correction1=target.correction,
+            shape0=start.shape,
+            shape1=target.shape,
+            rate0=self.log_rate_1_s,
+        )
 
     def _append(self, segment: Segment, target: SineTarget) -> "Trajectory":
         phase = float(segment.phase(np.ones(1), self.rate_hz)[0]) % 1.0
