@@ -155,22 +155,27 @@ def plan_open_loop_drive(profile: Profile, rig: RigConfig) -> Drive:
 
     InputError for an adaptive test, a swept sine or a continuation, which decide while they run.
     """
-    if profile.swept_sine is not None:
-        raise InputError(
+    own_drive = "use a rig that this program drives"
+    for excitation, problem, remedy in (
+        (
+            profile.swept_sine,
             "its level is corrected while the frequency moves, which another controller cannot do",
-            where=f"rig {rig.name}",
-            key="excitation.kind",
-            value=profile.excitation.kind,
-            remedy="use a rig that this program drives",
-        )
-    if profile.continuation is not None:
-        raise InputError(
+            own_drive,
+        ),
+        (
+            profile.continuation,
             "orbits are held by a feedback to the command, which another controller cannot give",
-            where=f"rig {rig.name}",
-            key="excitation.kind",
-            value=profile.excitation.kind,
-            remedy="use a rig that this program drives, with a command queue it can replace",
-        )
+            f"{own_drive}, with a command queue it can replace",
+        ),
+    ):
+        if excitation is not None:
+            raise InputError(
+                problem,
+                where=f"rig {rig.name}",
+                key="excitation.kind",
+                value=profile.excitation.kind,
+                remedy=remedy,
+            )
     plan = procedure.make_test_plan(profile, rig)
     if make_policy(profile) is not None:
         tables = [name for name in ("dwell", "track", "refine") if getattr(profile, name)]

@@ -22,9 +22,7 @@ from table_io.records import SweepLevel
 
 SLOPE_POINTS = 5  # of the extrapolation
 MAX_SLOPE = 15.0  # of ln(ratio) over ln f: a resonance of 3 % damping
-LIMIT_SHARE = (
-    0.96  # of a limit, at which a notch aims: a jump of the specimen takes some of the rest
-)
+LIMIT_SHARE = 0.96  # of a limit, at which a notch aims: a jump of the specimen takes of the rest
 RISE_SHARE = 0.5  # of `clamp_db`, by which a notch may open in an update
 MAX_SWEEP_CORRECTION = 20.0  # of the command: 26 dB of roll-off
 MIN_RATIO = 1e-6  # of two amplitudes: below is a dead channel

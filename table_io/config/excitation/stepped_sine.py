@@ -20,7 +20,7 @@ from table_io.config.excitation import (
 )
 from table_io.config.excitation.waveform import (
     LevelPoints,
-    check_level_points,
+    check_points_in_band,
     interpolate_level,
 )
 from table_io.errors import InputError
@@ -115,12 +115,7 @@ class Sweep(Excitation):
             raise InputError("directions contains one twice", allowed="each once, in any order")
         return directions
 
-    @field_validator("level_points")
-    @classmethod
-    def _check_level_points(cls, points: LevelPoints, info: ValidationInfo) -> LevelPoints:
-        if points and {"start_hz", "stop_hz"} <= info.data.keys():
-            check_level_points(points, (info.data["start_hz"], info.data["stop_hz"]))
-        return points
+    _check_level_points = field_validator("level_points")(check_points_in_band)
 
     @field_validator("schedule_db")
     @classmethod

@@ -26,7 +26,7 @@ from table_io.config.base import (
 from table_io.config.excitation import Excitation, ExcitationPlan, register_excitation
 from table_io.config.excitation.waveform import (
     LevelPoints,
-    check_level_points,
+    check_points_in_band,
     interpolate_level,
 )
 from table_io.errors import InputError
@@ -127,12 +127,7 @@ class SweptSine(Excitation):
             )
         return repeats
 
-    @field_validator("level_points")
-    @classmethod
-    def _check_level_points(cls, points: LevelPoints, info: ValidationInfo) -> LevelPoints:
-        if points and {"start_hz", "stop_hz"} <= info.data.keys():
-            check_level_points(points, (info.data["start_hz"], info.data["stop_hz"]))
-        return points
+    _check_level_points = field_validator("level_points")(check_points_in_band)
 
     @field_validator("control_channels")
     @classmethod

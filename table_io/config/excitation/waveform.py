@@ -19,6 +19,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from pydantic import ValidationInfo
 
 from table_io.block import Float1D
 from table_io.config.base import Positive
@@ -75,6 +76,13 @@ def check_level_points(points: LevelPoints, ends_hz: Sequence[float]) -> None:
             allowed=f"points that cover {low:g} to {high:g} Hz",
             remedy="add a point at each end",
         )
+
+
+def check_points_in_band(points: LevelPoints, info: ValidationInfo) -> LevelPoints:
+    """Check the break points of an excitation from start_hz to stop_hz: a validator of pydantic."""
+    if points and {"start_hz", "stop_hz"} <= info.data.keys():
+        check_level_points(points, (info.data["start_hz"], info.data["stop_hz"]))
+    return points
 
 
 Baseline = Literal["none", "mean", "linear"]
