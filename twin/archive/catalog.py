@@ -8,7 +8,6 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -24,7 +23,7 @@ from twin.archive.run_row import (
     replace_nonfinite,
 )
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.report.run_index import find_run_folders
+from twin.report.run_index import find_run_folders, order_by_start
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection, DuckDBPyRelation  # of the extra `archive`
@@ -192,10 +191,7 @@ def _find_start(row: Row) -> tuple[float, float]:
         name, _, state = part.partition(" ")
         if name == "run.mcap":
             changed_s = float(state.split()[1]) / 1e9
-    try:
-        return datetime.fromisoformat(str(row["started_at"])).timestamp(), changed_s
-    except (ValueError, OverflowError):
-        return changed_s, changed_s
+    return order_by_start(row["started_at"], changed_s)
 
 
 def open_database() -> "DuckDBPyConnection":

@@ -5,6 +5,7 @@ each log that is done, `table.csv`, with --since `changes.csv`, and a folder for
 """
 
 import csv
+import io
 import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -277,9 +278,8 @@ def _list_change_rows(changes: Iterable[Change]) -> list[Row]:
 
 def _write_table(path: Path, rows: Sequence[Row]) -> None:
     """Write rows as CSV with a column for every key; the file is replaced as a whole."""
-    new = path.with_name(f"{path.name}.new")
-    with new.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, [*dict.fromkeys(name for row in rows for name in row)])
-        writer.writeheader()
-        writer.writerows(rows)
-    new.replace(path)
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, [*dict.fromkeys(name for row in rows for name in row)])
+    writer.writeheader()
+    writer.writerows(rows)
+    replace_text(path, text.getvalue())

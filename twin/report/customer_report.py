@@ -22,6 +22,7 @@ from twin.drawing.page import embed_images, render_page
 from twin.drawing.panels import CaptionedFigure, Picture
 from twin.drawing.pictures import RC_PARAMS, render_figure, save_figures
 from twin.report.figures import draw_figures
+from twin.results.excitation_verdict import list_level_errors
 from twin.results.report_data import ReportData
 from twin.results.sensor_table import build_sensor_rows
 from twin.results.summary import parse_toml_tables
@@ -165,13 +166,14 @@ def _list_results(run: ReportData) -> tuple[Rows, tuple[str, ...]]:
             ]  # fmt: skip
         return rows, ()
     headers = ("f in Hz", "direction", "demanded in g", "achieved in g", "error")
+    errors = {step.index: error for error, step in list_level_errors(summary.steps)}
     return [
         (
             f"{step.frequency_hz:g}",
             step.direction,
             f"{step.demanded_m_s2 / GRAVITY_M_S2:.4f}",
             f"{step.table_acc_fundamental_m_s2 / GRAVITY_M_S2:.4f}",
-            f"{100 * (step.table_acc_fundamental_m_s2 / step.demanded_m_s2 - 1):+.1f} %",
+            f"{100 * errors[step.index]:+.1f} %" if step.index in errors else "not known",
         )
         for step in run.steps
     ], headers

@@ -37,10 +37,17 @@ def _read_start(recording: Path) -> tuple[float, float]:
         changed_s = recording.stat().st_mtime
     except OSError:  # merged or moved since it was listed
         changed_s = 0.0
-    started_at = _read_run_info(recording.parent).get("started_at", "")
+    return order_by_start(_read_run_info(recording.parent).get("started_at", ""), changed_s)
+
+
+def order_by_start(started_at: object, changed_s: float) -> tuple[float, float]:
+    """Return (start, last change) of a recording in s since 1970, by which runs are sorted.
+
+    A start that is no date is the last change.
+    """
     try:
-        return datetime.fromisoformat(started_at).timestamp(), changed_s
-    except (ValueError, TypeError, OverflowError):
+        return datetime.fromisoformat(str(started_at)).timestamp(), changed_s
+    except (ValueError, OverflowError):
         return changed_s, changed_s
 
 
