@@ -74,9 +74,8 @@ def build_verdict(
     best, null = verdict.best, selection.null
     where = discovery.localization
     problem = discovery.prepared.problem
-    before, after, floor = (
-        problem.measure_misfit(null), problem.measure_misfit(best), find_noise_floor(discovery)
-    )  # fmt: skip
+    before, after = problem.measure_misfit(null), problem.measure_misfit(best)
+    floor = problem.find_noise_floor(best)
     names = best.names
     alternatives = [fitted.names for fitted in verdict.alternatives]
     blind_to = [effect.candidate.name for effect in verdict.blind_to]
@@ -103,8 +102,8 @@ def build_verdict(
         gap=Gap(
             metric=METRIC,
             given=problem.measure_misfit(discovery.given),
-            before=problem.measure_fitted_misfit(null),
-            after=problem.measure_fitted_misfit(best),
+            before=problem.measure_fitted_misfit(null.fit),
+            after=problem.measure_fitted_misfit(best.fit),
             noise_floor=floor,
             held_out_before=before,
             held_out_after=after,
@@ -169,10 +168,10 @@ def _build_staircase(discovery: Discovery, proposal: LawProposal | None) -> list
     if generic is not None and verdict.outcome == "unexplained":
         term = generic.names[-1].split(".", 1)[1]
         steps.append((f"with the general law {term}", generic))
-    measure = discovery.prepared.problem.measure_misfit
+    problem = discovery.prepared.problem
     return [
-        *(MisfitStep(label=label, misfit=measure(fitted)) for label, fitted in steps),
-        MisfitStep(label="noise floor", misfit=find_noise_floor(discovery)),
+        *(MisfitStep(label=label, misfit=problem.measure_misfit(each)) for label, each in steps),
+        MisfitStep(label="noise floor", misfit=problem.find_noise_floor(verdict.best)),
     ]
 
 
@@ -296,11 +295,6 @@ def build_sensors(checks: Sequence[SensorCheck]) -> Sensors:
     return Sensors(state="healthy" if is_healthy else "to be mended", checks=rows)
 
 
-def find_noise_floor(discovery: Discovery) -> float:
-    """Return the rms over the noise that noise alone leaves; below 1 where it was overestimated."""
-    return min(1.0, discovery.prepared.problem.measure_misfit(discovery.verdict.best))
-
-
 def _build_effect(candidate: Candidate, fit: FitResult, confidence: float) -> EffectResult:
     """Return an effect with its confidence and its parameters, each with its 95 % interval."""
     effect = EffectResult(
@@ -415,7 +409,7 @@ def _build_generic_term(general: FittedSet, problem: SelectionProblem) -> Generi
 
 def _build_law(proposal: LawProposal, problem: SelectionProblem) -> ProposedLaw:
     before, after = problem.measure_misfit(proposal.start), proposal.misfit
-    floor = min(1.0, after)
+    floor = problem.find_noise_floor(proposal.fitted)
     fitted = proposal.fitted
     terms = fitted.effects[len(proposal.start.effects) :]
     return ProposedLaw(

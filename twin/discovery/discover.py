@@ -330,7 +330,7 @@ def _judge(
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)
-    noise = min(1.0, problem.measure_misfit(verdict.best)) ** 2
+    noise = problem.find_noise_floor(verdict.best) ** 2
     null_samples, of_null = _evaluate_samples(problem, selection.null)
     before = build_cells(null_samples, of_null, noise)
     localization = localize_excess(null_samples, of_null, before, steps)

@@ -17,7 +17,6 @@ from matplotlib.patches import Patch
 
 from table_io.block import Float1D, Float2D
 from table_io.records import Step
-from twin.discovery.build_verdict import find_noise_floor
 from twin.discovery.figure_data import DiscoveryView, is_periodic, list_phases
 from twin.discovery.force_figures import (
     GENERIC_COLOUR,
@@ -317,7 +316,8 @@ def _draw_time(view: DiscoveryView) -> CaptionedFigures:
                 ax.yaxis.set_major_formatter("{x:g}")
                 ax.yaxis.set_minor_formatter("")
         for ax, name in zip(axes, rows, strict=True):
-            floor = find_noise_floor(view.discovery) ** 2
+            discovery = view.discovery
+            floor = discovery.prepared.problem.find_noise_floor(discovery.verdict.best) ** 2
             low, high = ax.get_ylim()
             ax.axhline(floor, color=TWIN_COLOUR, ls="--", lw=0.9)
             ax.set_ylim(min(low, 0.08 * floor), max(high, 12 * floor))

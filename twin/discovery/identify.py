@@ -77,12 +77,7 @@ class IdentificationResult:
     @property
     def rms_over_noise(self) -> float:
         """Rms of the residual in motion over the noise of the sensors, whatever the weights."""
-        squares, count = 0.0, 0
-        for residuals in self.problem.log_residuals:
-            r = residuals.evaluate(self.fit.parameters) * residuals.entry_weight
-            r = r[residuals.entry_row < len(residuals.rows)]
-            squares, count = squares + float(r @ r), count + r.size
-        return math.sqrt(squares / max(count, 1))
+        return self.problem.measure_fitted_misfit(self.fit)
 
     @property
     def correlated_pairs(self) -> tuple[tuple[str, str, float], ...]:

@@ -109,7 +109,7 @@ def select_law(
         key=lambda start: len(start.effects),
     )
     before, after = problem.measure_misfit(starts[0]), problem.measure_misfit(best)
-    closed_share = closed_fraction(before, after, min(1.0, after))
+    closed_share = closed_fraction(before, after, problem.find_noise_floor(best))
     if closed_share < MIN_CLOSED_SHARE or not problem.is_worthwhile(start, best):
         return None
     terms = best.effects[len(start.effects) :]

@@ -136,17 +136,24 @@ class SelectionProblem:
 
     def measure_misfit(self, fitted: FittedSet) -> float:
         """Return the rms over the noise of the sensors of the cross-validation residual."""
+        return self._measure_rms(fitted.held_out)
+
+    def measure_fitted_misfit(self, fit: FitResult) -> float:
+        """Return the same of the data that were fitted."""
+        return self._measure_rms([each.evaluate(fit.parameters) for each in self.log_residuals])
+
+    def find_noise_floor(self, fitted: FittedSet) -> float:
+        """Return the misfit that noise alone leaves, below 1 where a set shows that it is less."""
+        return min(1.0, self.measure_misfit(fitted))
+
+    def _measure_rms(self, entries: Sequence[Float1D]) -> float:
+        """Return the rms over the noise of the sensors of residuals in motion, (entry,) each."""
         squares, count = 0.0, 0
-        for held_out, residuals in zip(fitted.held_out, self.log_residuals, strict=True):
+        for values, residuals in zip(entries, self.log_residuals, strict=True):
             moving = residuals.entry_row < len(residuals.rows)
-            r = (held_out * residuals.entry_weight)[moving]
+            r = (values * residuals.entry_weight)[moving]
             squares, count = squares + float(r @ r), count + r.size
         return math.sqrt(squares / max(count, 1))
-
-    def measure_fitted_misfit(self, fitted: FittedSet) -> float:
-        """Return the same of the data that a set was fitted to."""
-        entries = tuple(each.evaluate(fitted.fit.parameters) for each in self.log_residuals)
-        return self.measure_misfit(replace(fitted, fit=replace(fitted.fit, held_out=entries)))
 
     def measure_level(self, fitted: FittedSet) -> float:
         """Return the level of the forces left; 1 if they are noise and unknown errors."""
