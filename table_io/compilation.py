@@ -240,11 +240,20 @@ class _KernelCache:
         parts = (
             fingerprint_kernel(self._function),
             repr(signature),
+            *_list_classes(signature),
             repr(codegen.magic_tuple()),
             _identify_compiler(),
         )
         key = hashlib.sha256("\0".join(parts).encode()).hexdigest()
         return Path(self.cache_path) / f"{self._function.__name__}-{key[:40]}.kernel"
+
+
+def _list_classes(signature: Any) -> Iterator[str]:
+    """Yield where the classes of tuples with names lie: what was compiled is loaded with them."""
+    for item in getattr(signature, "args", signature):
+        if isinstance(item, types.BaseNamedTuple):
+            yield f"{item.instance_class.__module__}.{item.instance_class.__qualname__}"
+        yield from _list_classes(getattr(item, "types", ()))
 
 
 @compute_once

@@ -136,6 +136,26 @@ def test_signatures_do_not_share_what_was_compiled(import_package: Any) -> None:
         assert set(kernel.stats.cache_hits.values()) == ({1} if hits else set())
 
 
+def test_class_of_an_argument_that_has_moved_is_not_looked_for_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+
+    @jit_kernel()
+    def add_pair(nested: Any) -> float:
+        return nested[0].first + nested[0].second
+
+    for place in ("place_before", "place_after"):
+        source = "from typing import NamedTuple\nclass Pair(NamedTuple):\n    first: float\n"
+        (tmp_path / f"{place}.py").write_text(f"{source}    second: float\n")
+        pair = importlib.import_module(place).Pair(1.0, 2.0)
+        assert jit_kernel()(add_pair.py_func)((pair,)) == 3.0  # type: ignore[attr-defined]
+        (tmp_path / f"{place}.py").unlink()
+        monkeypatch.delitem(sys.modules, place)
+        importlib.invalidate_caches()
+
+
 @pytest.fixture
 def import_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
     """Return a function that imports the package with these values, each time under a new name."""
