@@ -1,6 +1,6 @@
 """Continuation of measured orbits: references, corrected until the feedback vanishes.
 
-All harmonics are real vectors (`orbit_plan.py`) at the phase of the table's acceleration, in m. An
+All harmonics are real vectors (`PlannedOrbit`) at the phase of the table's acceleration, in m. An
 orbit is unknown in its reference r (harmonics of x) and in its frequency f. Held with the feedback
 c, the harmonics x of the motion show how far r is off: without feedback the motion would be
 x - J c, with J the derivative of x with respect to the command. Newton's residual is therefore
@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.config.excitation.orbit_plan import (
+from table_io.config.excitation.continuation import (
     OrbitPlan,
     PlannedOrbit,
     pack_harmonics,

@@ -1,18 +1,21 @@
 """Provenance of a computed file: the rig, specimens and recordings that it was made for and from.
 
 The twin of a table, a drive and an identified model carry it as a table [provenance]; whoever uses
-one compares it with the test at hand. Keys carry their unit in the name.
+one compares it with the test at hand. Keys carry their unit in the name. Texts that end with their
+own hash (`seal_text`) let whoever reads one notice what was altered.
 """
 
 import hashlib
 import json
 import math
+import re
 from collections.abc import Sequence
 
 from pydantic import Field
 
 from table_io.config.base import ConfigModel, NonNegative, Number, Positive
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 
 HASH_PATTERN = "^[0-9a-f]{64}$"
 MAX_MASS_DIFFERENCE = 0.01  # of the mass of the specimen: what a weighing leaves uncertain
@@ -95,3 +98,32 @@ class Provenance(ConfigModel):
 
 def _join(values: Sequence[float]) -> str:
     return ", ".join(f"{value:g}" for value in values)
+
+
+NOTE = "# The last line is the SHA-256 of the lines above."
+SEAL = re.compile(r"# sha256 ([0-9a-f]{64})")
+
+
+def seal_text(text: str) -> str:
+    """Return a text, of which lines with # are comments, with a note and the hash of its lines."""
+    lines = [*text.splitlines(), NOTE]
+    return "\n".join([*lines, f"# sha256 {_hash_lines(lines)}", ""])
+
+
+def require_seal(text: str, name: str, remedy: str) -> None:
+    """Raise InputError where a sealed text is not what was written.
+
+    One without note and hash is of an earlier version or written by hand, and is accepted.
+    """
+    lines = text.splitlines()
+    while lines and not lines[-1]:
+        lines.pop()
+    seal = SEAL.fullmatch(lines[-1]) if lines else None
+    if seal is None and NOTE not in text:
+        return
+    if seal is None or seal[1] != _hash_lines(lines[:-1]):
+        raise InputError(f"{name} was altered after it was written", remedy=remedy)
+
+
+def _hash_lines(lines: list[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()

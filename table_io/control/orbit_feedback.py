@@ -23,7 +23,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from table_io.block import Float1D, Int1D
-from table_io.config.excitation.orbit_plan import unpack_harmonics
+from table_io.config.excitation.continuation import unpack_harmonics
 from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.drive import Correction, Drive
 

@@ -54,10 +54,11 @@ from table_io.safety.sample_checks import (
     TABLE_GAIN,
     TABLE_LAG,
     SampleCheckState,
+    Thresholds,
     check_samples,
+    compute_thresholds,
     make_sample_state,
 )
-from table_io.safety.thresholds import Thresholds, compute_thresholds
 from table_io.sensor_errors import highpass
 from table_io.units import GRAVITY_M_S2
 

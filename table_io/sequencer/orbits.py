@@ -36,8 +36,10 @@ from table_io.config.excitation.continuation import (
     CAPTURE_CYCLES,
     UPDATE_BLEND_CYCLES,
     Continuation,
+    OrbitPlan,
+    pack_harmonics,
+    unpack_harmonics,
 )
-from table_io.config.excitation.orbit_plan import OrbitPlan, pack_harmonics, unpack_harmonics
 from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, advance_feedback
 from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
 from table_io.excitation.trajectory import SineTarget, Trajectory

@@ -19,6 +19,7 @@ from tests.input_errors import raises_input_error
 from twin.campaign import gap_comparison, simulate_grid
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import find_campaign, read_plan
+from twin.campaign.figures import draw_gap_figures, spread_labels
 from twin.campaign.gap_comparison import (
     CRITERIA,
     GapComparison,
@@ -30,7 +31,6 @@ from twin.campaign.gap_comparison import (
     list_record_runs,
     rank_gaps,
 )
-from twin.campaign.gap_figures import draw_gap_figures, spread_labels
 from twin.campaign.messages import print_gap_comparison
 from twin.campaign.report import LARGER, SMALLER, SYMBOLS, list_gap_tables
 from twin.campaign.result import GapResult, MergedRun

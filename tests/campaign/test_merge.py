@@ -4,8 +4,8 @@ from pathlib import Path
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Check
-from twin.campaign.merge import merge_summaries
 from twin.campaign.state import RunPart, RunState
+from twin.campaign.summary import merge_summaries
 from twin.recording.reader import read_recording
 from twin.results.summary import summarise
 from twin.setup.run_config import read_run_config

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from table_io.config.excitation.orbit_plan import pack_harmonics
+from table_io.config.excitation.continuation import pack_harmonics
 from tests.model.reference import AG, snm
 from twin.dynamics.continuation import continue_branch
 from twin.dynamics.event_driven_map import make_period_map

@@ -10,9 +10,8 @@ import pytest
 from table_io.config.base import parse_toml
 from table_io.config.excitation import History
 from table_io.config.profile import Specimen, load_profile
-from table_io.config.provenance import HashedFile, Provenance
+from table_io.config.provenance import HashedFile, Provenance, seal_text
 from table_io.config.rig import RigConfig
-from table_io.config.sealed_text import seal_text
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import list_setup_warnings

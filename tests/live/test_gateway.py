@@ -24,7 +24,7 @@ from twin.live.gateway import (
 )
 from twin.live.process_config import ProcessConfig, process_token
 from twin.setup.run_config import read_run_config
-from twin.system.temporary_folders import SOCKET_PREFIX, make_private_folder
+from twin.system.files import SOCKET_PREFIX, make_private_folder
 from twin.transport.codec import TOPIC_TYPES, decode_item, encode_item
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, MEAS_TOPIC, key_expression, list_runs
 from twin.transport.reliable_subscriber import ReliableSubscriber

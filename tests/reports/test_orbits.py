@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from table_io.config.base import parse_toml
-from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
+from table_io.config.excitation.continuation import OrbitPlan, PlannedOrbit
 from table_io.config.profile import Profile
 from table_io.records import OrbitPoint, RunStart, RunStop, Step
 from tests.model.reference import snm

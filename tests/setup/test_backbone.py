@@ -16,10 +16,10 @@ from tests.model.reference import snm
 from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming
-from twin.setup.orbit_plan import make_backbone_plan
-from twin.setup.phase_resonance import (
+from twin.setup.orbit_plan import (
     find_phase_resonance,
     find_resonance_approach,
+    make_backbone_plan,
     measure_orbit_phase,
 )
 from twin.setup.run_config import read_run_config

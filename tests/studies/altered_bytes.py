@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 
 from table_io.config.excitation.drive_file import format_drive, parse_drive
-from table_io.config.provenance import Provenance
-from table_io.config.sealed_text import seal_text
+from table_io.config.provenance import Provenance, seal_text
 from table_io.errors import InputError
 from tests.cli.test_hostile_toml import OWN
 from tests.studies.random_laws import PROFILE

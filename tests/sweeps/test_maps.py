@@ -25,14 +25,12 @@ from twin.laws.library import find_effect
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.results.ideal_points import compute_prc_points
-from twin.studies.maps.cases import list_parameter_names, parameter_unit
+from twin.studies.maps.cases import list_parameter_names, parameter_unit, sample_parameters
 from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.config import StudyConfig
 from twin.studies.maps.figures import FrontGroup
 from twin.studies.maps.page import write_map_page
-from twin.studies.maps.results import find_front
-from twin.studies.maps.sampling import sample_parameters
-from twin.studies.maps.sensitivity import compute_sensitivity
+from twin.studies.maps.results import compute_sensitivity, find_front
 from twin.studies.maps.store import make_seeds, open_group
 from twin.studies.maps.study import Study
 

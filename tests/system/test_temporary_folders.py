@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from twin.system import temporary_folders
-from twin.system.temporary_folders import (
+from twin.system import files
+from twin.system.files import (
     MIN_AGE_S,
     SOCKET_PREFIX,
     VIEW_PREFIX,
@@ -22,9 +22,9 @@ from twin.system.temporary_folders import (
 OWNER = """
 import sys, time
 from pathlib import Path
-from twin.system import temporary_folders
-temporary_folders.find_temporary_parent = lambda: Path(sys.argv[1])
-folder = temporary_folders.make_private_folder(sys.argv[2])
+from twin.system import files
+files.find_temporary_parent = lambda: Path(sys.argv[1])
+folder = files.make_private_folder(sys.argv[2])
 (folder / "bus").touch()
 print(folder, flush=True)
 time.sleep(60)
@@ -40,7 +40,7 @@ def make_old(folder: Path, prefix: str, ages: float = 1.1) -> None:
 def test_the_folder_of_a_killed_process_is_removed_at_the_next_start(
     prefix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(temporary_folders, "find_temporary_parent", lambda: tmp_path)
+    monkeypatch.setattr(files, "find_temporary_parent", lambda: tmp_path)
     command = [sys.executable, "-c", OWNER, str(tmp_path), prefix]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
         assert owner.stdout is not None

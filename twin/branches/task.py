@@ -9,7 +9,7 @@ from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
 from twin.branches.page import write_branch_report
 from twin.branches.resonance_map import write_map_report
-from twin.drawing.attractor_study import AttractorStudy, study_attractors
+from twin.drawing.basin_figures import AttractorStudy, study_attractors
 from twin.drawing.branch_curves import BranchSet, make_axis
 from twin.dynamics.diagram import compute_diagram
 from twin.dynamics.event_driven_map import make_period_map

@@ -8,9 +8,9 @@ from rich.table import Table
 from table_io.clock import local_datetime
 from twin.campaign.config import PlannedRun
 from twin.campaign.gap_comparison import CRITERIA, format_best, format_gap
-from twin.campaign.merge import merge_summaries
 from twin.campaign.result import GapResult, Spread
 from twin.campaign.state import ActiveCampaign, OperatorAnswer, read_part_summaries
+from twin.campaign.summary import merge_summaries
 from twin.results.summary import format_summary
 from twin.system.terminal import console, print_line, print_table
 

@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.config.excitation.orbit_plan import Complex1D, pack_harmonics
+from table_io.config.excitation.continuation import Complex1D, pack_harmonics
 from twin.dynamics.orbits import Orbit
 from twin.model.contact_regime import STATE_SIZE as CLOSED_FORM_STATE_SIZE
 from twin.model.event_integrator_kernel import (

@@ -42,7 +42,7 @@ def write_folder_report(
 
         return (write_campaign_report(folder),)
     if (folder / TABLE_FILE).is_file():
-        from twin.studies.page import write_study_page
+        from twin.studies.figures import write_study_page
 
         return (write_study_page(folder),)
     if (folder / DEFINITION_FILE).is_file():

@@ -18,8 +18,7 @@ from table_io.records import Comparison, Event, Fault, RunStop, Timing
 from twin.live.process_config import ProcessConfig, process_token
 from twin.recording.merge import LOCK_FILE
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.system.files import lock_file
-from twin.system.temporary_folders import SOCKET_PREFIX, make_private_folder
+from twin.system.files import SOCKET_PREFIX, lock_file, make_private_folder
 from twin.transport.codec import RECORD_TOPICS, Item, decode_item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX, check_can_listen
 from twin.transport.reliable_subscriber import ReliableSubscriber

@@ -37,10 +37,14 @@ from twin.drawing.prc_drawing import (
     shade_hysteresis,
     shade_precompression,
 )
-from twin.drawing.step_figures import draw_histories, draw_legend, draw_loop_figures
-from twin.drawing.sweep_figure import draw_swept_sine
+from twin.drawing.run_figures import (
+    draw_histories,
+    draw_legend,
+    draw_loop_figures,
+    draw_swept_sine,
+    draw_window_histories,
+)
 from twin.drawing.table_motion_figures import draw_table_motion
-from twin.drawing.window_figure import draw_window_histories
 from twin.dynamics.main_branches import follow_sweep_branches
 from twin.results.report_data import (
     DIRECTIONS,

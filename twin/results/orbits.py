@@ -10,8 +10,7 @@ from pydantic import ValidationError
 
 from table_io.block import Float1D
 from table_io.config.excitation import find_excitation
-from table_io.config.excitation.continuation import Continuation
-from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.config.excitation.continuation import Continuation, OrbitPlan
 from table_io.errors import InputError
 from table_io.records import OrbitPoint
 from twin.recording.reader import Recording

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from twin.drawing.page import embed_images, write_page
 from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
 from twin.drawing.pictures import direction_handles, save_figures
 from twin.drawing.plot_style import (
@@ -33,8 +34,9 @@ from twin.drawing.plot_style import (
 )
 from twin.drawing.prc_drawing import FREE_PANELS, PRC_PANELS, PrcPanel, make_prc_panels, plot_prc
 from twin.results.report_data import Curve
+from twin.studies import TABLE_FILE
 from twin.studies.batch import format_gap_mm
-from twin.studies.result import CaseSummary, Row, SweepSummary
+from twin.studies.result import REMEDY, CaseSummary, Row, SweepSummary, read_batch_rows
 
 Curves = dict[str, list[Row]]  # direction -> rows in ascending frequency
 CaseCurves = dict[tuple[str, float], Curves]  # (model, gap in mm) -> curves
@@ -268,3 +270,16 @@ def _legend_handles(cases: list[CaseSummary]) -> list[Line2D | Patch]:
         )
         for direction, kind in jumps
     ]
+
+
+def write_study_page(folder: Path) -> Path:
+    """Write folder/report.html and its figures; return the path."""
+    summary = SweepSummary.read(folder / "summary.json", REMEDY)
+    pictures = draw_study_figures(read_batch_rows(folder / TABLE_FILE), summary, folder / "figures")
+    return write_page(
+        folder,
+        Path(__file__).with_name("batch.html"),
+        summary=summary,
+        images=embed_images(pictures),
+        format_gap=format_gap_mm,
+    )

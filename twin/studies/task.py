@@ -24,7 +24,7 @@ from twin.studies.batch import (
     read_models,
     simulate_case,
 )
-from twin.studies.page import write_study_page
+from twin.studies.figures import write_study_page
 from twin.studies.result import BatchTable, CaseSummary, ModelText, SweepRun, SweepSummary
 from twin.system.grid import Watch, run_grid
 from twin.system.process_pool import Workers

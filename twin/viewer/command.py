@@ -13,8 +13,7 @@ from twin.recording.run_paths import resolve_log_path
 from twin.results.rerun import restore_predictions
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
-from twin.system.files import lock_folder
-from twin.system.temporary_folders import VIEW_PREFIX, make_private_folder
+from twin.system.files import VIEW_PREFIX, lock_folder, make_private_folder
 from twin.system.terminal import print_line
 from twin.transport.zenoh_link import open_spoke
 from twin.viewer.address import VIEW_ADDRESS, find_free_address, format_live_view, viewer_url

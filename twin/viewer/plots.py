@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from table_io.block import Float1D, Float2D
-from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.config.excitation.continuation import OrbitPlan
 from table_io.records import JumpForecast, OrbitPoint, PrcPoint
 from twin.viewer.view_model import list_orbit_curves, list_prc_curves
 

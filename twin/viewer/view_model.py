@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from table_io.config.excitation.orbit_plan import OrbitPlan
+from table_io.config.excitation.continuation import OrbitPlan
 from table_io.records import Agreement, Estimate, NormalizedResponse, OrbitPoint, PrcPoint
 
 MIN_DRIFT_SIGMA = 3.0  # standard deviations beyond which a drift is marked

@@ -12,15 +12,9 @@ import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
 from table_io.backends.command_buffer import find_newest_sample, refuse_late_command
-from table_io.backends.udp.link import (
+from table_io.backends.udp.packets import (
     ANSWER_TIMEOUT_S,
     REASON_TEXTS,
-    UdpLink,
-    UdpWiring,
-    query_target,
-    rig_checksum,
-)
-from table_io.backends.udp.packets import (
     RING_SAMPLES,
     VALUES_PER_PACKET,
     Bool1D,
@@ -30,6 +24,10 @@ from table_io.backends.udp.packets import (
     Reason,
     RigPacket,
     TargetState,
+    UdpLink,
+    UdpWiring,
+    query_target,
+    rig_checksum,
     sequence_difference,
 )
 from table_io.block import Float1D, Float2D

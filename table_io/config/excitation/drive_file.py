@@ -13,8 +13,7 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, parse_toml
-from table_io.config.provenance import Provenance
-from table_io.config.sealed_text import require_seal, seal_text
+from table_io.config.provenance import Provenance, require_seal, seal_text
 from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 

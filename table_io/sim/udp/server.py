@@ -16,7 +16,6 @@ import numpy as np
 
 from table_io.backends.machine import protocol
 from table_io.backends.machine.protocol import MachineMessage, text_message, values_message
-from table_io.backends.udp.link import UdpWiring, rig_checksum
 from table_io.backends.udp.packets import (
     MAX_PIECES,
     RIG_PACKET_BYTES,
@@ -28,8 +27,10 @@ from table_io.backends.udp.packets import (
     Reason,
     RigPacket,
     TargetState,
+    UdpWiring,
     decode_rig_packet,
     encode_target_state,
+    rig_checksum,
     sequence_difference,
 )
 from table_io.block import Float1D, Float2D

@@ -17,7 +17,7 @@ from table_io.adaptive.continuation import (
     rotate_harmonics,
     table_harmonics,
 )
-from table_io.config.excitation.orbit_plan import OrbitPlan, PlannedOrbit
+from table_io.config.excitation.continuation import OrbitPlan, PlannedOrbit
 
 A, MASS, DAMPING = 0.49, 550.0, 1100.0
 FOLD_HZ, FOLD_M, CURVATURE = 4.0, 5e-3, 4.0e4  # f = FOLD_HZ - CURVATURE (|U_1| - FOLD_M)^2

@@ -19,16 +19,18 @@ from table_io.backends import (
     open_backend,
 )
 from table_io.backends.udp.backend import UdpBackend
-from table_io.backends.udp.link import REASON_TEXTS, UdpWiring, query_target
 from table_io.backends.udp.packets import (
+    REASON_TEXTS,
     PacketKind,
     Phase,
     Reason,
     RigPacket,
     TargetState,
+    UdpWiring,
     decode_target_state,
     encode_rig_packet,
     encode_target_state,
+    query_target,
     sequence_difference,
 )
 from table_io.clock import RealClock

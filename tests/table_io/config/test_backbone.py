@@ -5,8 +5,12 @@ from typing import Any
 import pytest
 
 from table_io.config.base import parse_toml
-from table_io.config.excitation.continuation import MAX_POINT_PERIODS, Backbone
-from table_io.config.excitation.orbit_plan import OrbitPlan, parse_orbit_plan
+from table_io.config.excitation.continuation import (
+    MAX_POINT_PERIODS,
+    Backbone,
+    OrbitPlan,
+    parse_orbit_plan,
+)
 from tests.input_errors import raises_input_error
 from tests.table_io.config.test_orbit_plan import make_plan
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from table_io.config.excitation.orbit_plan import (
+from table_io.config.excitation.continuation import (
     OrbitPlan,
     PlannedOrbit,
     pack_harmonics,

@@ -8,8 +8,7 @@ import pytest
 
 from table_io.block import Float1D
 from table_io.config.base import parse_toml
-from table_io.config.excitation.record import RecordedHistory, resample
-from table_io.config.excitation.record_files import SeriesRequest, read_series
+from table_io.config.excitation.record import RecordedHistory, SeriesRequest, read_series, resample
 from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
 from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_excitation

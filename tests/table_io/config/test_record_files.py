@@ -11,8 +11,8 @@ import pytest
 from scipy import io as scipy_io
 
 from table_io.config.base import parse_toml
-from table_io.config.excitation.record import RecordedHistory
-from table_io.config.excitation.record_files import (
+from table_io.config.excitation.record import (
+    RecordedHistory,
     RecordedSeries,
     SeriesRequest,
     convert_binary,

@@ -4,7 +4,7 @@ import random
 
 import pytest
 
-from table_io.config.sealed_text import require_seal, seal_text
+from table_io.config.provenance import require_seal, seal_text
 from table_io.errors import InputError
 
 TEXT = 'title = "A table"\nresidual = 0.02\n[parameters]\ngain_1_s = 20.0\n'

@@ -42,9 +42,10 @@ from table_io.safety.sample_checks import (
     VELOCITY,
     CheckRun,
     SampleCheckState,
+    Thresholds,
+    compute_thresholds,
     make_sample_state,
 )
-from table_io.safety.thresholds import Thresholds, compute_thresholds
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_profile
 from tests.builders.rigs import NOISE_SI, RIG

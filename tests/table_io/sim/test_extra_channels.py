@@ -11,7 +11,7 @@ from table_io.clock import ManualClock
 from table_io.config.calibration import command_to_volts, compute_tare, volts_to_si
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.safety.thresholds import compute_thresholds
+from table_io.safety.sample_checks import compute_thresholds
 from table_io.safety.wiring_check import RestingInputs, check_resting_inputs, list_stimuli
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.rigs import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, make_lab_rig

@@ -19,7 +19,6 @@ from hypothesis import strategies as st
 
 from table_io.backends import HEARTBEAT_TIMEOUT_S
 from table_io.backends.command_buffer import plan_stop
-from table_io.backends.udp.link import rig_checksum
 from table_io.backends.udp.packets import (
     RING_SAMPLES,
     TARGET_PACKET_BYTES,
@@ -32,6 +31,7 @@ from table_io.backends.udp.packets import (
     TargetState,
     decode_target_state,
     encode_rig_packet,
+    rig_checksum,
 )
 from table_io.block import Float1D
 from table_io.config.base import parse_toml

@@ -20,12 +20,12 @@ from twin.drawing.pictures import save_figures
 from twin.studies.maps.config import VariedParameter
 from twin.studies.maps.outcomes import OutcomeVariable
 from twin.studies.maps.results import (
+    SensitivityIndices,
     StudyResults,
     find_front,
     format_plain,
     format_unit,
 )
-from twin.studies.maps.sensitivity import SensitivityIndices
 
 MAX_PANELS = 6  # of the values of a third parameter
 MAX_SLICES = 7  # lines of one figure

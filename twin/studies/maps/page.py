@@ -10,8 +10,13 @@ from table_io.block import Float2D
 from twin.drawing.page import embed_images, write_page
 from twin.studies.maps.figures import draw_outcome_figures, group_front, label_variable
 from twin.studies.maps.outcomes import OutcomeVariable
-from twin.studies.maps.results import StudyResults, format_plain, format_unit
-from twin.studies.maps.sensitivity import SensitivityIndices, compute_sensitivity
+from twin.studies.maps.results import (
+    SensitivityIndices,
+    StudyResults,
+    compute_sensitivity,
+    format_plain,
+    format_unit,
+)
 from twin.system.files import is_folder_locked
 
 MAX_TABLE_CASES = 200_000  # in cases.csv

@@ -14,9 +14,9 @@ from twin.setup.disk import format_size, free_bytes
 from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
 from twin.setup.run_config import make_run_id
 from twin.studies import DEFINITION_FILE
+from twin.studies.maps.cases import sample_parameters
 from twin.studies.maps.compute import compute_chunk, compute_outcomes, make_sweep_plan
 from twin.studies.maps.page import write_map_page
-from twin.studies.maps.sampling import sample_parameters
 from twin.studies.maps.store import (
     Manifest,
     StoredChunk,

@@ -1,4 +1,4 @@
-"""Figures of selected steps: time histories, phase portraits and force loops.
+"""Figures of a run: selected steps, a displacement history over time, the level of a swept sine.
 
 Steps come from `report_data.select_frequencies`: at most four frequencies, both directions each.
 """
@@ -8,6 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from table_io.block import Block, Float1D
+from table_io.channels import contact_forces, relative_displacement
+from table_io.units import GRAVITY_M_S2
 from twin.drawing.motion_drawing import (
     draw_rest_lines,
     plot_bumper_loops,
@@ -34,6 +37,7 @@ from twin.results.report_data import (
     pair_motions,
     select_frequencies,
 )
+from twin.results.windows import cut_blocks, extract_free_twin, join_channel
 
 HISTORY_CYCLES = 3
 CONTACT_ALPHAS = 0.22, 0.10  # right, left
@@ -226,3 +230,132 @@ def _draw_grid(
         ax.set_ylabel(names[3])
     draw_legend(run, figure, *_list_gap_line_keys(run))
     yield CaptionedFigure(names[0], names[1], caption, figure)
+
+
+MAX_PLOTTED_SAMPLES = 20_000
+RESIDUALS: tuple[tuple[str, float, Callable[[Block], Float1D]], ...] = (
+    ("residual\n$u$ in mm", 1e3, relative_displacement),
+    ("residual\n$a$ in m/s²", 1.0, lambda block: join_channel([block], "mass_acc_m_s2")),
+)
+
+
+def draw_window_histories(run: ReportData) -> CaptionedFigures:
+    """Draw table, u, a and contact forces over the whole history, measured and twin."""
+    windows = run.windows
+    if not windows:
+        return
+    rate_hz = run.recording.start.rate_hz
+    first, end = round(windows[0].from_s * rate_hz), round(windows[-1].to_s * rate_hz)
+    measured = cut_blocks(run.streams["meas"], first, end)
+    twin = [extract_free_twin(block) for block in cut_blocks(run.streams["pred"], first, end)]
+    rows = 4 if run.has_bumpers else 3
+    strips = RESIDUALS if run.source == "measured" and twin else ()
+    heights = [2.0] * rows + [1.0] * len(strips)
+    size_in = FIGURE_WIDTH_IN, 0.88 * sum(heights) + 0.5
+    figure = PanelFigure(size_in, len(heights), heights=heights)
+    axes = figure.panels[:, 0]
+    sources = [(twin, twin_style("forward"))]
+    if run.source == "measured":
+        sources.insert(0, (measured, measured_style("forward")))
+    stride = max(1, (end - first) // MAX_PLOTTED_SAMPLES)
+    for block in measured:
+        axes[0].plot(
+            block.time_s[::stride],
+            block.channel("table_disp_m")[::stride] * 1e3,
+            color=GUIDE_COLOUR,
+        )
+    for blocks, style in sources:
+        for block in blocks:
+            right, left = contact_forces(block)
+            acceleration = join_channel([block], "mass_acc_m_s2")
+            curves = relative_displacement(block) * 1e3, acceleration, right * 1e-3, left * 1e-3
+            for row, curve in zip((1, 2, 3, 3), curves, strict=True):
+                if row < rows:
+                    axes[row].plot(block.time_s[::stride], curve[::stride], **style)
+    time_s = np.arange(first, end)[::stride] / rate_hz
+    for axis, (label, scale, extract) in zip(axes[rows:], strips, strict=True):
+        difference = _join(measured, extract, first, end) - _join(twin, extract, first, end)
+        axis.plot(time_s, scale * difference[::stride], color=TWIN_COLOUR, lw=0.8)
+        axis.axhline(0, color=GUIDE_COLOUR, lw=0.5)
+        axis.set_ylabel(label)
+    if run.gaps_m is not None:
+        draw_rest_lines(run.gaps_m, axes[1].axhline)
+    labels = ("table in mm", "$u$ in mm", "$a$ in m/s²", "$F_R$, $F_L$ in kN")[:rows]
+    for axis, label in zip(axes, labels, strict=False):
+        axis.set_ylabel(label)
+        for window in windows[1::2]:
+            axis.axvspan(window.from_s, window.to_s, color=GUIDE_COLOUR, alpha=0.07, lw=0)
+    axes[-1].set_xlabel("time in s")
+    axes[-1].set_xlim(windows[0].from_s, windows[-1].to_s)
+    caption = (
+        "Wide and pale: measured. Black: twin, free-running on the measured table acceleration; "
+        "after an impact in a chaotic motion it cannot be reproduced sample by sample. Residual: "
+        "measured minus twin. Bands: windows."
+    )
+    yield CaptionedFigure("history", "Response over time", caption, figure)
+
+
+def _join(
+    blocks: Sequence[Block], extract: Callable[[Block], Float1D], first: int, end: int
+) -> Float1D:
+    """Return a quantity of blocks at the samples first .. end - 1, NaN where there is none."""
+    values = np.full(end - first, np.nan)
+    for block in blocks:
+        values[block.index - first : block.end - first] = extract(block)
+    return values
+
+
+TOLERANCE_COLOUR, PREDICTED_COLOUR = "#e9edf3", "#2e9e5b"
+
+
+def draw_swept_sine(run: ReportData) -> CaptionedFigures:
+    """Draw the level of each pass, up and down, with its tolerance and what it deviates by."""
+    result = run.summary.swept_sine
+    if result is None:
+        return
+    figure = PanelFigure((FIGURE_WIDTH_IN, 5.4), 2, heights=(2.2, 1.0))
+    level, ratio = figure.panels[:, 0]
+    grid = sorted({(point.frequency_hz, point.reference_m_s2) for point in result.points})
+    hz, reference = np.array(grid).T
+    level.plot(hz, reference / GRAVITY_M_S2, color=GUIDE_COLOUR, lw=0.9, label="level of the test")
+    low, high = 1.0 - result.tolerance, 1.0 + result.tolerance
+    ratio.axhspan(low, high, color=TOLERANCE_COLOUR, lw=0, label=f"+-{100 * result.tolerance:g} %")
+    abort = 10.0 ** (result.abort_db / 20.0)
+    if max(result.highest_ratio, 1.0 / result.lowest_ratio) > 1.0 + 4.0 * result.tolerance:
+        for bound in (abort, 1.0 / abort):
+            ratio.axhline(bound, color="#c4161c", lw=0.8, ls="--")
+    labelled: set[str] = set()
+    for sweep in sorted({point.sweep for point in result.points}):
+        points = [point for point in result.points if point.sweep == sweep]
+        direction = points[0].direction
+        if direction == "dwell":
+            continue
+        style = measured_style(direction)
+        f, demanded, achieved, predicted = np.array(
+            [(p.frequency_hz, p.demanded_m_s2, p.achieved_m_s2, p.predicted_m_s2) for p in points]
+        ).T
+        foreseen = np.isfinite(predicted)
+        if foreseen.any():
+            label = {} if labelled else {"label": "predicted notch"}
+            predicted_g = predicted[foreseen] / GRAVITY_M_S2
+            level.plot(f[foreseen], predicted_g, color=PREDICTED_COLOUR, lw=1.0, **label)
+        label = {} if direction in labelled else {"label": f"achieved, {direction}"}
+        level.plot(f, achieved / GRAVITY_M_S2, **style, **label)
+        ratio.plot(f, achieved / demanded, **style)
+        labelled.add(direction)
+    level.set_ylabel("level in g")
+    level.set_yscale("log")
+    ratio.set_ylabel("achieved / demanded")
+    ratio.set_xlabel("frequency in Hz")
+    ratio.set_xscale("log")
+    level.set_xscale("log")
+    for entry in result.resonances:
+        level.axvline(entry.frequency_hz, color=GUIDE_COLOUR, lw=0.6, ls=":")
+    level.legend()
+    ratio.legend()
+    caption = (
+        "Fundamental of the control channels over a few cycles at each point. The demand is the "
+        "level of the test, reduced where a limit needs it (a notch). Band: tolerance of the "
+        "profile; dotted: resonances found."
+    )
+    yield CaptionedFigure("swept_sine", "Level of the swept sine", caption, figure)
