@@ -28,7 +28,14 @@ from table_io.records import (
 )
 from twin.transport import codec, endpoint
 from twin.transport import shaketwin_pb2 as pb
-from twin.transport.codec import Item, WireError, decode_item, encode_item, topic_for
+from twin.transport.codec import (
+    Item,
+    WireError,
+    decode_item,
+    encode_comparisons,
+    encode_item,
+    topic_for,
+)
 
 STREAM = Path(codec.__file__).parent
 ODD = (float("nan"), float("inf"), float("-inf"), -0.0, 5e-324, 1.7976931348623157e308)
@@ -317,6 +324,19 @@ def test_a_record_without_its_run_is_that_of_any_run(kind: type, data: st.DataOb
     assert stripped[0] == stripped[1] == encode_item(record, "")
     other = encode_item(record, "b")
     assert codec.strip_run(other, kind, "a") == other
+
+
+@pytest.mark.parametrize("run", ["", "a", "r" * 200])
+def test_comparisons_at_once_have_the_bytes_of_each(run: str) -> None:
+    numbers = iter(np.random.default_rng(1).standard_normal(400).tolist())
+    series = [
+        Comparison(index, count, names, *(tuple(next(numbers) for _ in names) for _ in range(3)))
+        for names in (("u", "a"), (), tuple("abcdefghijklmnopqrst"))
+        for index, count in ((0, 7), (7, 20), (127, 20), (2**40, 20))
+    ]
+    series.append(Comparison(5, 1, ("u", "a"), ODD[:2], ODD[2:4], ODD[4:]))
+    assert encode_comparisons(series, run) == [encode_item(each, run) for each in series]
+    assert encode_comparisons([], run) == []
 
 
 def test_a_flat_schema_has_its_columns_in_order() -> None:

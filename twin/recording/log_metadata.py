@@ -28,11 +28,11 @@ class ContentHash:
         self._hash = hashlib.sha256()
         self._counts: Counter[str] = Counter()
 
-    def add(self, topic: str, log_time: int, payload: bytes) -> None:
-        """Add one message; `log_time` in ns."""
-        self._hash.update(b"%s %d %d\n" % (topic.encode(), log_time, len(payload)))
-        self._hash.update(payload)
+    def add(self, topic: str, log_time: int, payload: bytes) -> int:
+        """Add one message, `log_time` in ns; return how many its topic has."""
+        self._hash.update(b"%s %d %d\n%s" % (topic.encode(), log_time, len(payload), payload))
         self._counts[topic] += 1
+        return self._counts[topic]
 
     def to_metadata(self) -> dict[str, str]:
         """Return the values of the metadata record "content"."""

@@ -1,7 +1,7 @@
 """Writer and reader of the log: an MCAP file with the protobuf payloads of the bus.
 
 `LOG.md` in this folder specifies the format. Profile, rig, model and calibration are written before
-the first message, so that an interrupted recording is self-contained. Only this file imports mcap.
+the first message, so that an interrupted recording is self-contained.
 """
 
 import contextlib
@@ -32,6 +32,7 @@ from twin.recording.log_metadata import (
     hash_attachments,
     select_recorded,
 )
+from twin.recording.mcap_writer import McapWriter
 from twin.recording.recovery import LogMessage, recover_log
 from twin.transport.codec import (
     TOPIC_TYPES,
@@ -74,18 +75,14 @@ class AppendOnlyFile:
         """Number of buffered bytes that are not in the file yet."""
         return len(self._pending)
 
-    def write(self, data: bytes) -> int:
-        """Append to the buffer; return the number of bytes."""
+    def write(self, data: bytes) -> None:
+        """Append to the buffer."""
         self._pending += data
         self._size += len(data)
-        return len(data)
 
     def tell(self) -> int:
         """Return the number of bytes written so far, including the buffer."""
         return self._size
-
-    def flush(self) -> None:
-        """Do nothing; mcap calls it, but `drain` decides when data are written."""
 
     def drain(self) -> None:
         """Write the buffer to the operating system."""
@@ -194,11 +191,8 @@ class LogWriter:
     def __init__(self, path: Path, rate_hz: float, chunk_bytes: int = CHUNK_BYTES) -> None:
         self._rate_hz = rate_hz
         self._file = AppendOnlyFile(path)
-        # the checksum of the data section reveals a record lost inside the file
-        self._writer = Writer(self._file, chunk_bytes, enable_data_crcs=True)
-        self._writer.start(profile="shaketwin", library="shaketwin")
+        self._writer = McapWriter(self._file.write, chunk_bytes)
         self._channels: dict[str, int] = {}
-        self._next_sequence: dict[str, int] = {}
         self._content = ContentHash()
         self._start: RunStart | None = None
         self._finished = False
@@ -236,19 +230,12 @@ class LogWriter:
         if log_time > MAX_LOG_TIME_NS:
             raise LogTimeError(f"sample {index}: its time exceeds the range of a log")
         if topic not in self._channels:
-            name, data = message_schema(TOPIC_TYPES[topic])
-            schema_id = self._writer.register_schema(name, "protobuf", data)
-            self._channels[topic] = self._writer.register_channel(topic, "protobuf", schema_id)
-        sequence = self._next_sequence.get(topic, 0)
-        self._next_sequence[topic] = sequence + 1
-        self._content.add(topic, log_time, payload)
-        self._writer.add_message(
-            self._channels[topic],
-            log_time=log_time,
-            data=payload,
-            publish_time=wall_clock_ns() if publish_time is None else publish_time,
-            sequence=sequence % 2**32,
-        )
+            schema = message_schema(TOPIC_TYPES[topic])
+            self._channels[topic] = self._writer.add_channel(topic, *schema)
+        sequence = self._content.add(topic, log_time, payload) - 1
+        time_ns = wall_clock_ns() if publish_time is None else publish_time
+        channel = self._channels[topic]
+        self._writer.add_message(channel, sequence % 2**32, log_time, time_ns, payload)
         if self._file.pending_bytes > MAX_PENDING_BYTES:
             self._file.drain()
 
@@ -263,7 +250,7 @@ class LogWriter:
         self.write_metadata("attachments", hash_attachments(texts))
         for name, data in texts.items():
             media = f"application/{MEDIA_TYPES[Path(name).suffix]}"
-            self._writer.add_attachment(wall_clock_ns(), 0, name, media, data)
+            self._writer.add_attachment(wall_clock_ns(), name, media, data)
 
     def write_metadata(self, name: str, values: dict[str, str]) -> None:
         """Write a metadata record."""
@@ -271,7 +258,7 @@ class LogWriter:
 
     def flush(self) -> None:
         """Close the chunk and write it, so that its data survive a crash of this process."""
-        self._writer.flush()
+        self._writer.close_chunk()
         self._file.drain()
 
     @property
@@ -291,7 +278,7 @@ class LogWriter:
         """Finish the file with its content hash and close it; may be called again."""
         if not self._finished:
             self._finished = True
-            self._writer.flush()
+            self._writer.close_chunk()
             self.write_metadata("content", self._content.to_metadata())
             self._writer.finish()
         self._file.close()

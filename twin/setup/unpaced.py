@@ -19,6 +19,7 @@ from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.records import (
+    Comparison,
     Record,
     RunStart,
     RunStop,
@@ -29,7 +30,7 @@ from twin.recording.mcap_log import LogWriter
 from twin.setup.realtime import check_full_speed
 from twin.setup.run_config import RunConfig
 from twin.setup.swept_prediction import generate_swept_twin
-from twin.transport.codec import Item, encode_item, topic_for
+from twin.transport.codec import Item, encode_comparisons, encode_item, topic_for
 
 ItemHandler = Callable[[Item], None]
 PayloadHandler = Callable[[Item, bytes], None]
@@ -70,19 +71,34 @@ def record_items(
     """
     writer = LogWriter(path, rate_hz)
     flushed_index = 0
+    compared: list[Comparison] = []  # since the last item of another kind, encoded at once
+
+    def write(part: Item, payload: bytes) -> None:
+        on_payload(part, payload)
+        writer.write(topic_for(part), payload, part.index)
+
+    def write_compared() -> None:
+        for item, payload in zip(compared, encode_comparisons(compared, run), strict=True):
+            write(item, payload)
+            on_item(item)
+        compared.clear()
+
     try:
         for item in items:
+            if isinstance(item, Comparison):
+                compared.append(item)
+                continue
+            write_compared()
             if isinstance(item, RunStart):
                 writer.write_run_description(item)
             for part in writer.select_recorded(item):
-                payload = encode_item(part, run)
-                on_payload(part, payload)
-                writer.write(topic_for(part), payload, part.index)
+                write(part, encode_item(part, run))
             if item.index - flushed_index > FLUSH_INTERVAL_S * rate_hz:
                 writer.flush()
                 flushed_index = item.index
             on_item(item)
     finally:
+        write_compared()
         writer.close()
 
 
