@@ -10,7 +10,7 @@ from twin.paper.page import (
     write_paper_page,
 )
 from twin.paper.study import JOB_COUNT, run_paper_study
-from twin.paper.table import DEPARTS, make_comparison_table
+from twin.paper.table import DEPARTS, count_causes, make_comparison_table
 from twin.results.measured_campaign import MeasuredCampaign, load_measured_campaign
 from twin.results.paper_cases import load_paper_cases
 from twin.setup.folders import make_output_folder
@@ -56,5 +56,10 @@ def write_comparison(folder: Path, campaign: MeasuredCampaign | None, source: Mo
         print_line(f"{row.case}: paper: {row.paper}; {source.name}: {row.model}")
         style = "bold red" if row.verdict == DEPARTS else ""
         console.print(f"    {row.verdict}", style=style, highlight=False)
-    departures = sum(row.verdict == DEPARTS for row in rows)
-    print_line(f"{source.name}: {len(rows)} statements, {departures} depart -> {page}")
+    causes = count_causes(rows)
+    for cause, count in causes.items():
+        print_line(f"departs in {count}: {cause}")
+    print_line(
+        f"{source.name}: {len(rows)} statements, {sum(causes.values())} depart for {len(causes)} "
+        f"causes -> {page}"
+    )

@@ -21,7 +21,8 @@ from twin.results.report_data import DIRECTIONS
 SCANNED_HZ = 0.45, 1.7  # from below the range of the tests to above the last secondary resonance
 EVALUATED_CYCLES = 6  # of each frequency of the scan
 MIN_WIDTH_HZ = 0.005  # a narrower interval is a detail within a chaotic band
-EXPONENT_BLOCKS = 20  # consecutive blocks whose scatter gives the error of an exponent
+EXPONENT_BLOCKS = 20  # consecutive blocks whose scatter gives the error of a mean
+BLOCK_CYCLES = 20  # of a block in which internal loops are counted
 SEQUENCE_CYCLES = 60  # cycles of which impacts are measured one by one
 
 
@@ -119,6 +120,41 @@ def measure_impact_sequence(
         np.mean(peaks, axis=0).tolist(), np.mean(durations, axis=0).tolist(),
         len(chosen) / len(groups),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class InternalLoops:
+    """Internal loops of the phase portrait per cycle, (right, left): mean and standard error.
+
+    `reaching`: share of them that intersect the line of the obstacle.
+    """
+
+    mean: tuple[float, float]
+    error: tuple[float, float]
+    reaching: float
+
+
+def count_internal_loops(case: PaperCase, frequency_hz: float) -> InternalLoops:
+    """Count the turning points of u beyond the first on each side, over the cycles of a motion.
+
+    From rest, without the transient. The error is that of the mean of consecutive blocks.
+    """
+    a, simulator = case.acceleration, case.simulator
+    state = simulator.sweep([frequency_hz], a, choose_effort(case).transient_cycles).states[0]
+    u = simulator.simulate_motion(frequency_hz, a, state, EXPONENT_BLOCKS * BLOCK_CYCLES).u
+    turns, reached = np.empty((2, EXPONENT_BLOCKS)), np.empty(2)
+    for side, position in enumerate((u, -u)):
+        before, here, after = position[:-2], position[1:-1], position[2:]
+        is_turn = (here > before) & (here >= after) & (here > 0)
+        blocks = np.array_split(is_turn, EXPONENT_BLOCKS)
+        turns[side] = [block.sum() / BLOCK_CYCLES - 1 for block in blocks]
+        is_inner = is_turn & (here > case.gaps_m[side])
+        reached[side] = is_inner.sum() / (EXPONENT_BLOCKS * BLOCK_CYCLES) - 1
+    mean, error = turns.mean(axis=1), turns.std(axis=1, ddof=1) / np.sqrt(EXPONENT_BLOCKS)
+    share = float(reached.clip(min=0).sum() / mean.sum()) if mean.sum() > 0 else 0.0
+    return InternalLoops(
+        (float(mean[0]), float(mean[1])), (float(error[0]), float(error[1])), share
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from twin.paper.frequency_figures import draw_chaos_figure, draw_frequency_figur
 from twin.paper.secondary_resonances import draw_secondary_resonance_figure
 from twin.paper.sketches import draw_sketches
 from twin.paper.study import PaperStudy
-from twin.paper.table import VERDICTS, ComparisonRow
+from twin.paper.table import VERDICTS, ComparisonRow, count_causes
 from twin.results.contract import format_json
 from twin.results.measured_campaign import MeasuredCampaign
 from twin.setup.run_config import read_model
@@ -84,6 +84,7 @@ def write_paper_json(
     document: dict[str, Any] = {
         "model": {"name": source.name, "title": source.config.title, "toml": source.toml_text},
         "table": [asdict(row) | {"paper": row.paper} for row in rows],
+        "departures": count_causes(rows),
         "prc": {
             name: [
                 {"frequency_hz": point.frequency_hz, "direction": point.direction}
@@ -122,6 +123,7 @@ def write_paper_page(
         rows=rows,
         sets=figure_images,
         counts=counts,
+        causes=count_causes(rows),
         model=source,
         exact=study.is_exact,
         models={name: case.simulator.model.flatten() for name, case in study.cases.items()},

@@ -9,7 +9,7 @@ import numpy as np
 from table_io.block import Float1D
 from twin.paper import findings, low_frequency
 from twin.paper.findings import Folds, ImpactDistribution
-from twin.paper.low_frequency import ChaosMeasure, SecondaryResonances
+from twin.paper.low_frequency import ChaosMeasure, InternalLoops, SecondaryResonances
 from twin.paper.slow_passage import SlowSweep, run_slow_sweep
 from twin.results.paper_cases import PaperCase, load_paper_cases
 from twin.system.process_pool import map_in_threads
@@ -35,6 +35,7 @@ class PaperStudy:
     exponents: Float1D  # per cycle, at CHAOS_SCAN_HZ, G4
     chaos: dict[float, ChaosMeasure]  # G4, at the paper's frequencies up to 1.4 Hz
     secondary: dict[str, SecondaryResonances]  # of the positive gaps
+    loops: dict[float, InternalLoops]  # G4, at the paper's frequencies up to 1.4 Hz
 
     @property
     def is_exact(self) -> bool:
@@ -73,6 +74,7 @@ def run_paper_study(
     frequencies = (*SECONDARY_HZ, IRREGULAR_HZ)
     impacts = run_parallel(lambda hz: findings.compute_impact_distribution(g4, hz), frequencies)
     chaos = run_parallel(lambda hz: low_frequency.measure_chaos(g4, hz), frequencies)
+    loops = run_parallel(lambda hz: low_frequency.count_internal_loops(g4, hz), frequencies)
     secondary = run_parallel(
         lambda name: low_frequency.find_secondary_resonances(cases[name]), POSITIVE_GAPS
     )
@@ -84,7 +86,8 @@ def run_paper_study(
         dict(zip(frequencies, impacts, strict=True)), np.array(exponents),
         dict(zip(frequencies, chaos, strict=True)),
         dict(zip(POSITIVE_GAPS, secondary, strict=True)),
+        dict(zip(frequencies, loops, strict=True)),
     )  # fmt: skip
 
 
-JOB_COUNT = 9 + 8 + 4 + 4 + len(POSITIVE_GAPS) + CHAOS_SCAN_HZ.size
+JOB_COUNT = 9 + 8 + 4 + 4 + 4 + len(POSITIVE_GAPS) + CHAOS_SCAN_HZ.size

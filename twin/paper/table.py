@@ -5,6 +5,7 @@ has the function that computes each. No parameter is tuned to agree.
 """
 
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -27,6 +28,7 @@ from twin.paper.study import (
     PaperStudy,
 )
 from twin.results.paper_cases import PaperCase
+from twin.results.players import SystemMotion
 from twin.results.report_data import DIRECTIONS, extract_prc
 
 AGREES, IN_KIND, DEPARTS = "agrees", "agrees in kind", "departs"
@@ -38,6 +40,8 @@ MAX_CURVE_DIFFERENCE = 0.1  # of the peak; curves within it overlap
 MAX_CHAOTIC_HZ = 1.5  # above it the model is periodic
 ZERO_GAP_HZ = 4.8  # resonance of G0 in the paper
 NO_HYSTERESIS = "no hysteresis"
+BUMPER_RATIOS = {"eta_j": ("eta_r", "eta_l"), "r_j": ("r_r", "r_l")}
+_SYMBOLS = {"eta_d": "η_d", "eta_a": "η_a", "eta_j": "η_j", "r_j": "r_j"}
 TREND_GAPS = (*POSITIVE_GAPS, "G0", "G-1")  # in the order of the paper's trends
 RowValues = dict[str, float | str | bool | list[int] | list[float] | list[list[float]]]
 
@@ -58,6 +62,7 @@ class ComparisonRow:
     """Quotes of the paper, result of the model, verdict, and the rule of the verdict.
 
     `paper_note`: what the paper gives beside the quoted words, such as a frequency in a caption.
+    `cause`: why the model departs; "" where it does not.
     """
 
     key: str
@@ -68,6 +73,7 @@ class ComparisonRow:
     rule: str
     values: RowValues = field(default_factory=dict)
     paper_note: str = ""
+    cause: str = ""
 
     @property
     def paper(self) -> str:
@@ -92,8 +98,8 @@ class ModelFinding:
 def make_comparison_table(study: PaperStudy) -> list[ComparisonRow]:
     """Return every row, in the order of the paper."""
     text = Path(__file__).with_name("statements.toml").read_text(encoding="utf-8")
-    rows = []
-    for statement in tomllib.loads(text)["statement"]:
+    document, rows = tomllib.loads(text), []
+    for statement in document["statement"]:
         finding = FINDINGS[statement["key"]](study)
         if finding is None:
             continue
@@ -111,9 +117,17 @@ def make_comparison_table(study: PaperStudy) -> list[ComparisonRow]:
                 finding.rule or statement["rule"],
                 finding.values,
                 statement.get("note", ""),
+                document["causes"].get(statement.get("cause"), f"{statement['key']}, for itself")
+                if finding.verdict == DEPARTS
+                else "",
             )
         )
     return rows
+
+
+def count_causes(rows: Sequence[ComparisonRow]) -> dict[str, int]:
+    """Count the departures by their cause, most frequent first."""
+    return dict(Counter(row.cause for row in rows if row.verdict == DEPARTS).most_common())
 
 
 def _judge(agrees: bool, in_kind: bool = False) -> str:
@@ -256,6 +270,97 @@ def _find_acceleration_trend(study: PaperStudy) -> ModelFinding:
     )
 
 
+def _find_transition_trend(study: PaperStudy) -> ModelFinding:
+    names = ("G4", "G0", "G-1")
+    values: RowValues = {q: _list_peaks(study, q)[-len(names) :] for q in ("eta_d", "eta_a")}
+    for quantity, sides in BUMPER_RATIOS.items():
+        values[quantity] = [
+            float(_list_ratios(study.cases[name].points, *sides).max()) for name in names
+        ]
+    texts = [f"{_SYMBOLS[name]} {_list(series, '.4f')}" for name, series in values.items()]
+    return ModelFinding(
+        f"largest {'; '.join(texts)}", _judge(all(map(_falls, values.values()))), values
+    )
+
+
+def _compare_sides(study: PaperStudy) -> ModelFinding:
+    """Compare the ratios of both bumpers: their largest values, and at every frequency."""
+    of_peaks, anywhere = [], []
+    for name in (*TREND_GAPS, "G-2", "G-10"):
+        points = study.cases[name].points
+        for sides in BUMPER_RATIOS.values():
+            right, left = (_list_ratios(points, side) for side in sides)
+            of_peaks.append(abs(float(left.max() / right.max()) - 1))
+            difference = np.abs(right - left) / right.max()
+            at = int(difference.argmax())
+            anywhere.append((float(difference[at]), name, points[at].frequency_hz))
+    most, name, hz = max(anywhere)
+    return ModelFinding(
+        f"the largest values of B_R and B_L differ by up to {100 * max(of_peaks):.1f} %; at one "
+        f"frequency by up to {100 * most:.0f} % of them ({name}, {hz:g} Hz)",
+        _judge(max(of_peaks) < MAX_CURVE_DIFFERENCE),
+        {"of_peaks": max(of_peaks), "anywhere": most},
+    )
+
+
+def _compare_quantities(motions: Sequence[SystemMotion], case: PaperCase) -> list[float]:
+    """Return how far the directions differ in η_d, η_a, η_j, r_j, relative to the larger one."""
+    peaks = np.array(
+        [
+            [np.ptp(each.u), np.ptp(each.a), (each.u - case.gaps_m[0]).max(), each.force_r.max()]
+            for each in motions
+        ]
+    ).clip(min=0.0)
+    return (np.ptp(peaks, axis=0) / peaks.max(axis=0)).tolist()
+
+
+def _format_quantities(differences: Sequence[float]) -> str:
+    return ", ".join(
+        f"{symbol} {100 * share:.0f} %"
+        for symbol, share in zip(_SYMBOLS.values(), differences, strict=True)
+    )
+
+
+def _find_hysteresis_in_all(study: PaperStudy) -> ModelFinding:
+    case, scan = study.cases["G4"], study.secondary["G4"]
+    rows = {COEXISTING_HZ: [case.simulate_motion(COEXISTING_HZ, d, 4) for d in DIRECTIONS]}
+    for interval in scan.intervals:
+        hz = (interval.from_hz + interval.to_hz) / 2
+        rows[hz] = [
+            low_frequency.simulate_secondary_motion(case, scan, hz, d, 4) for d in DIRECTIONS
+        ]
+    differences = {hz: _compare_quantities(motions, case) for hz, motions in rows.items()}
+    texts = [f"at {hz:.3g} Hz {_format_quantities(row)}" for hz, row in differences.items()]
+    return ModelFinding(
+        "forward and backward differ " + "; ".join(texts),
+        _judge(len(rows) > 1 and min(map(min, differences.values())) > MAX_DIRECTION_DIFFERENCE),
+        {"differences": [*differences.values()]},
+    )
+
+
+def _find_softening_in_all(study: PaperStudy) -> ModelFinding | None:
+    """Compare the directions within the hysteresis of G-1; None without."""
+    hz, case = _middle_of_softening(study), study.cases["G-1"]
+    if hz is None:
+        return None
+    sweep, simulator = study.slow_sweeps["G-1"], case.simulator
+    motions = []
+    for direction in DIRECTIONS:
+        state = findings.settle_state(case, sweep, hz, direction)
+        motions.append(simulator.simulate_motion(hz, case.acceleration, state, 4))
+    differences = _compare_quantities(motions, case)
+    return ModelFinding(
+        f"forward and backward differ at {hz:.3f} Hz {_format_quantities(differences)}",
+        _judge(min(differences) > MAX_DIRECTION_DIFFERENCE),
+        {"differences": differences},
+    )
+
+
+def _middle_of_softening(study: PaperStudy) -> float | None:
+    fold = study.folds["G-1"]
+    return None if fold is None else (fold.backward_hz + fold.forward_hz) / 2
+
+
 def _list_ratios(points: tuple[PrcPoint, ...], *names: str) -> Float1D:
     """Return ratios of the model at every point, (name, point) flattened."""
     return np.array([getattr(point.twin, name) for name in names for point in points])
@@ -264,7 +369,7 @@ def _list_ratios(points: tuple[PrcPoint, ...], *names: str) -> Float1D:
 def _find_bumper_trend(study: PaperStudy) -> ModelFinding:
     eta_j, r_j = (
         [float(_list_ratios(study.cases[name].points, *sides).max()) for name in TREND_GAPS]
-        for sides in (("eta_r", "eta_l"), ("r_r", "r_l"))
+        for sides in BUMPER_RATIOS.values()
     )
     largest = [int(np.argmax(values)) for values in (eta_j, r_j)]
     rises_and_falls = all(
@@ -500,6 +605,59 @@ def _compare_three_impacts(study: PaperStudy) -> ModelFinding:
     )
 
 
+def _format_loops(study: PaperStudy, hz: float) -> str:
+    right, left = map(format_uncertain, study.loops[hz].mean, study.loops[hz].error)
+    return f"at {hz:g} Hz {right} right, {left} left".replace("+", "")
+
+
+def _find_sides_apart(study: PaperStudy, hz: float) -> bool:
+    """Return whether the sides differ in internal loops, by a tenth and beyond chance."""
+    loops = study.loops[hz]
+    difference = abs(loops.mean[0] - loops.mean[1])
+    return bool(difference > max(3 * np.hypot(*loops.error), 0.1 * sum(loops.mean) / 2))
+
+
+def _find_growth_of_loops(study: PaperStudy) -> ModelFinding:
+    counts = [sum(study.loops[hz].mean) / 2 for hz in SECONDARY_HZ]
+    reaching = [study.loops[hz].reaching for hz in SECONDARY_HZ]
+    return ModelFinding(
+        f"{_list(counts, '.1f')} internal loops a side and cycle, "
+        f"{', '.join(f'{100 * share:.0f} %' for share in reaching)} of them intersecting an "
+        "obstacle, at 0.53, 0.71, 1.1 Hz",
+        _judge(_falls(counts) and _falls(reaching)),
+        {"loops": counts, "reaching": reaching},
+    )
+
+
+def _compare_sides_of_loops(study: PaperStudy) -> ModelFinding:
+    apart = [_find_sides_apart(study, hz) for hz in SECONDARY_HZ[:2]]
+    return ModelFinding(
+        "internal loops a cycle "
+        + ", ".join(_format_loops(study, hz) for hz in SECONDARY_HZ[:2])
+        + " (from rest, with standard errors)",
+        _judge(all(apart), any(apart)),
+        {"loops": [list(study.loops[hz].mean) for hz in SECONDARY_HZ[:2]]},
+    )
+
+
+def _find_symmetry_at_third(study: PaperStudy) -> ModelFinding:
+    hz = SECONDARY_HZ[2]
+    return ModelFinding(
+        f"internal loops a cycle {_format_loops(study, hz)}",
+        _judge(not _find_sides_apart(study, hz)),
+        {"loops": list(study.loops[hz].mean)},
+    )
+
+
+def _count_irregular_loops(study: PaperStudy) -> ModelFinding:
+    fewer, more = sorted(study.loops[IRREGULAR_HZ].mean)
+    return ModelFinding(
+        f"internal loops a cycle {_format_loops(study, IRREGULAR_HZ)}",
+        _judge(fewer < 0.1 and 0.5 < more < 1.5),
+        {"loops": [fewer, more]},
+    )
+
+
 def _compare_directions(study: PaperStudy) -> ModelFinding:
     """Compare forward and backward curves in the middle of each left hysteresis of G4."""
     scan, case = study.secondary["G4"], study.cases["G4"]
@@ -541,6 +699,8 @@ def _count_irregular_impacts(study: PaperStudy) -> ModelFinding:
 
 def format_uncertain(value: float, error: float) -> str:
     """Return a value with its standard error in units of the last digit, as +0.6099(12)."""
+    if error == 0:
+        return f"{value:+g}".replace("-", "−")
     digits = int(np.clip(1 - np.floor(np.log10(max(error, 1e-6))), 0, 6))
     return f"{value:+.{digits}f}({round(error * 10**digits)})".replace("-", "−")
 
@@ -603,7 +763,7 @@ def _find_zero_gap_resonance(study: PaperStudy) -> ModelFinding:
 def _measure_zero_gap_flight(study: PaperStudy) -> ModelFinding:
     flight = findings.measure_zero_gap_flight(study.cases["G0"], ZERO_GAP_HZ)
     return ModelFinding(
-        f"{100 * flight.share:.1f} % of the time in flight, {100 * flight.elastic_share:.1f} % "
+        f"{100 * flight.share:.2f} % of the time in flight, {100 * flight.elastic_share:.2f} % "
         "with a tenth of C_j",
         _judge(0 < flight.share < 0.05 and flight.elastic_share < flight.share / 5),
         {"share": flight.share, "elastic_share": flight.elastic_share},
@@ -634,10 +794,9 @@ def _find_softening(study: PaperStudy) -> ModelFinding:
 
 def _find_forward_contact(study: PaperStudy) -> ModelFinding | None:
     """Find whether the forward motion in the hysteresis of G-1 stays in contact; None without."""
-    case, fold = study.cases["G-1"], study.folds["G-1"]
-    if fold is None:
+    hz, case = _middle_of_softening(study), study.cases["G-1"]
+    if hz is None:
         return None
-    hz = (fold.backward_hz + fold.forward_hz) / 2
     precompression_mm = -1e3 * case.parameters.gap_r
     amplitude_mm = 1e3 * findings.steady_amplitude_m(case, study.slow_sweeps["G-1"], hz, "forward")
     stays = amplitude_mm <= precompression_mm
@@ -646,6 +805,22 @@ def _find_forward_contact(study: PaperStudy) -> ModelFinding | None:
         + ("always in contact" if stays else "it leaves each bumper for a moment"),
         _judge(stays),
         {"amplitude_mm": amplitude_mm},
+        hz,
+    )
+
+
+def _find_backward_contact(study: PaperStudy) -> ModelFinding | None:
+    """Find with how many bumpers the mass is in contact in the larger motion; None without."""
+    hz, case = _middle_of_softening(study), study.cases["G-1"]
+    if hz is None:
+        return None
+    shares = findings.measure_contact_shares(case, study.slow_sweeps["G-1"], hz, "backward")
+    both, one, none = shares
+    return ModelFinding(
+        f"in contact with both bumpers for {100 * both:.2f} % of the time, with one for "
+        f"{100 * one:.2f} %, with none for {100 * none:.2f} %",
+        _judge(both > 0 and one > 0 and none == 0),
+        {"shares": [*shares]},
         hz,
     )
 
@@ -714,11 +889,14 @@ FINDINGS: dict[str, Callable[[PaperStudy], ModelFinding | None]] = {
     "displacement_trend": _find_displacement_trend,
     "acceleration_trend": _find_acceleration_trend,
     "bumper_trend": _find_bumper_trend,
+    "transition_trend": _find_transition_trend,
+    "bumpers_alike": _compare_sides,
     "no_impact": _find_ratios_in_flight,
     "always_contact": _find_ratios_in_contact,
     "offset": _find_offset,
     "shift": _find_shift,
     "g4_coexisting": _find_coexistence,
+    "g4_quantities": _find_hysteresis_in_all,
     "left_hystereses": _find_left_hystereses,
     "secondary_number": _count_left_hystereses,
     "secondary_positions": _find_secondary_positions,
@@ -727,8 +905,12 @@ FINDINGS: dict[str, Callable[[PaperStudy], ModelFinding | None]] = {
     "g4_11": _count_impacts_at_third,
     "second_impact": _compare_second_impact,
     "three_impacts": _compare_three_impacts,
+    "loops_growth": _find_growth_of_loops,
+    "loops_left": _compare_sides_of_loops,
+    "loops_third": _find_symmetry_at_third,
     "superimposed": _compare_directions,
     "g4_14": _count_irregular_impacts,
+    "g4_14_loop": _count_irregular_loops,
     "g4_irregular": _find_chaotic_bands,
     "g4_chaos": _measure_chaos,
     "g4_growth": _measure_scatter,
@@ -737,6 +919,8 @@ FINDINGS: dict[str, Callable[[PaperStudy], ModelFinding | None]] = {
     "g0_release": _measure_release,
     "gm1": _find_softening,
     "gm1_forward": _find_forward_contact,
+    "gm1_backward": _find_backward_contact,
+    "gm1_quantities": _find_softening_in_all,
     "gm2": _find_small_precompression,
     "gm10": _find_large_precompression,
     "overlap": _find_overlap,

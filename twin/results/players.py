@@ -82,12 +82,14 @@ class HarmonicSimulator(ABC):
 
     @abstractmethod
     def sample(
-        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
+        self,
+        frequency_hz: float,
+        acceleration: float,
+        state: Float1D,
+        cycles: int,
+        samples: int = FINE_SAMPLES_PER_CYCLE,
     ) -> Float2D:
-        """Return u, v, total acceleration, F_R, F_L, u_R, u_L in SI, (7, sample).
-
-        `FINE_SAMPLES_PER_CYCLE` samples per cycle.
-        """
+        """Return u, v, total acceleration, F_R, F_L, u_R, u_L in SI, (7, cycles x samples)."""
 
     @abstractmethod
     def find_onsets(
@@ -102,14 +104,19 @@ class HarmonicSimulator(ABC):
         """Return (largest Lyapunov exponent per cycle, final state) from a settled state."""
 
     def simulate_motion(
-        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
+        self,
+        frequency_hz: float,
+        acceleration: float,
+        state: Float1D,
+        cycles: int,
+        samples: int = FINE_SAMPLES_PER_CYCLE,
     ) -> SystemMotion:
-        """Simulate the motion from a state, sampled for a figure."""
-        p, rate = self.parameters, frequency_hz * FINE_SAMPLES_PER_CYCLE
+        """Simulate the motion from a state; by default sampled for a figure."""
+        p = self.parameters
         u, v, acc, force_r, force_l, u_r, u_l = self.sample(
-            frequency_hz, acceleration, state, cycles
+            frequency_hz, acceleration, state, cycles, samples
         )
-        time = np.arange(u.size) / rate
+        time = np.arange(u.size) / (frequency_hz * samples)
         return SystemMotion(time, u, v, acc, force_r, force_l, u_r + p.gap_r, u_l - p.gap_l)
 
     def bumper_preload(self) -> dict[str, float]:
@@ -139,14 +146,19 @@ class ClosedFormSimulator(HarmonicSimulator):
         )
 
     def sample(
-        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
+        self,
+        frequency_hz: float,
+        acceleration: float,
+        state: Float1D,
+        cycles: int,
+        samples: int = FINE_SAMPLES_PER_CYCLE,
     ) -> Float2D:
-        count = cycles * FINE_SAMPLES_PER_CYCLE
-        base = acceleration * np.sin(2 * math.pi * np.arange(1, count + 1) / FINE_SAMPLES_PER_CYCLE)
+        count = cycles * samples
+        base = acceleration * np.sin(2 * math.pi * np.arange(1, count + 1) / samples)
         out = np.empty((OUTPUT_COUNT, count))
         closed_form.advance_state(
             state.copy(),
-            closed_form.discretized_params(self.parameters, frequency_hz * FINE_SAMPLES_PER_CYCLE),
+            closed_form.discretized_params(self.parameters, frequency_hz * samples),
             base,
             out,
         )
@@ -223,11 +235,14 @@ class NumericalSimulator(HarmonicSimulator):
         return SteppedSineResponse(extremes, np.array(ends))
 
     def sample(
-        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
+        self,
+        frequency_hz: float,
+        acceleration: float,
+        state: Float1D,
+        cycles: int,
+        samples: int = FINE_SAMPLES_PER_CYCLE,
     ) -> Float2D:
-        return self._advance(
-            frequency_hz, acceleration, state.copy(), cycles, FINE_SAMPLES_PER_CYCLE
-        )
+        return self._advance(frequency_hz, acceleration, state.copy(), cycles, samples)
 
     def find_onsets(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
