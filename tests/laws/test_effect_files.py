@@ -12,12 +12,14 @@ from table_io.errors import InputError
 from tests.discovery.played import SNM
 from twin.laws.effect_file import EffectFile, format_effect_file
 from twin.laws.expression import FUNCTIONS, build_function, parse_expression, parse_unit
+from twin.laws.library import find_effect
 from twin.laws.properties import evaluate_law, is_linear_in_rate
 from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import EffectInstance, Model
 from twin.model.prepare import prepare_solver
+from twin.model.solver import StateEstimate
 from twin.model.valid_range import find_range_exits
 
 HEADER = """title = "x"
@@ -313,3 +315,30 @@ def test_a_bumper_law_that_its_values_leave_undefined_is_refused() -> None:
     constants = tuple(effect.work_out_constants(SNM.base.as_dict(), values).values())
     with pytest.raises(InputError, match="cannot be evaluated with these values"):
         is_linear_in_rate(effect, constants)
+
+
+def test_a_law_that_divides_by_zero_has_no_number_there():
+    """The state is lost as where any other value is not finite, and the clock goes on."""
+    pole = "id = 'pole'\nforce = 'k * u / (u - w)'\n" + K.format(unit="N", typical=1.0)
+    pole += "[parameters.w]\nunit = 'm'\nlow = 1e-6\nhigh = 1.0\ntypical = 0.001\n"
+    solver, out = prepare_solver(add(read_effect(pole), k=1.0, w=0.001), 1000.0), np.zeros((7, 5))
+    state = solver.restart_state(StateEstimate(3, 0.001, 0.0))
+    solver.advance(state, np.zeros(5), np.zeros(5), out)
+    assert np.isnan(out).all()
+    assert np.isnan(state[:-1]).all()
+    assert state[-1] == 8.0
+
+
+@pytest.mark.parametrize("v0, base", [(0.0, 2.0), (0.0, -2.0), (-0.01, -2.0), (0.01, 2.0)])
+@pytest.mark.parametrize("name, value", [("position_damping", 1e-3), ("coulomb_friction", 1e-9)])
+def test_the_first_sample_keeps_its_velocity_in_either_direction(v0, base, name, value):
+    """A vanishing law with reversals of u' starts as the model without it does."""
+    effect = find_effect(name)
+    own = add(effect, **{effect.parameters[0].name: value})
+    drive, outs = np.full(20, -base), []
+    for model in (SNM, own):
+        solver, out = prepare_solver(model, 1000.0), np.empty((7, 20))
+        start = StateEstimate(0, 0.0005, v0, base_acc=base)
+        solver.advance(solver.restart_state(start), drive, drive, out)
+        outs.append(out)
+    assert outs[1][1] == pytest.approx(outs[0][1], rel=1e-5, abs=1e-9)

@@ -106,7 +106,11 @@ class EventDrivenSolver:
         added = self.model.added_acceleration(table_disp)
         base = base_acc if added is None else base_acc + added
         integrate = build_kernel(self.laws is not None)
-        integrate(state, self.coefficients, self.propagators, self.laws, base, out, _NO_EVENTS)
+        try:
+            integrate(state, self.coefficients, self.propagators, self.laws, base, out, _NO_EVENTS)
+        except ZeroDivisionError:  # of an added law, which has no number there
+            clock = state[CLOCK] + base.size
+            out[:], state[:CLOCK], state[CLOCK] = math.nan, math.nan, clock
         if added is not None:
             out[2] -= added
 

@@ -7,8 +7,8 @@ The Bouc-Wen law with exponent n = 2 and beta = gamma = 1/2: unloading is straig
 z depends on the path, not on the speed, and has a closed form between reversals of u':
     unloading (u' z < 0)  z = z0 + (u - u0) / uy     up to z = 0
     loading               z = tanh((u - u0) / uy + artanh z0)
-so no integration is needed. Passive: stored Fy uy z^2 / 2, loss Fy |z|^3 |u'|. Added stiffness at
-small amplitude Fy / uy. Source: Wen 1976, J. Eng. Mech. 102(2).
+so no integration is needed. Passive: stored Fy uy z^2 / 2, loss Fy |z|^3 |u'| while loading, none
+while unloading. Added stiffness at small amplitude Fy / uy. Source: Wen 1976, J. Eng. Mech. 102(2).
 """
 
 from twin.laws.effect import Effect, EffectParameter, State
