@@ -272,14 +272,14 @@ def _find_acceleration_trend(study: PaperStudy) -> ModelFinding:
 
 def _find_transition_trend(study: PaperStudy) -> ModelFinding:
     names = ("G4", "G0", "G-1")
-    values: RowValues = {q: _list_peaks(study, q)[-len(names) :] for q in ("eta_d", "eta_a")}
+    values = {q: _list_peaks(study, q)[-len(names) :] for q in ("eta_d", "eta_a")}
     for quantity, sides in BUMPER_RATIOS.items():
         values[quantity] = [
             float(_list_ratios(study.cases[name].points, *sides).max()) for name in names
         ]
     texts = [f"{_SYMBOLS[name]} {_list(series, '.4f')}" for name, series in values.items()]
     return ModelFinding(
-        f"largest {'; '.join(texts)}", _judge(all(map(_falls, values.values()))), values
+        f"largest {'; '.join(texts)}", _judge(all(map(_falls, values.values()))), {**values}
     )
 
 
