@@ -205,8 +205,8 @@ def test_internal_loops_on_the_motion(rows):
 
 def test_contact_in_the_softening_motion(rows):
     """One bumper at a time but for a tenth of the cycle, and never none."""
-    both, one, none = rows["gm1_backward"].values["shares"]
-    assert (both, one) == pytest.approx((0.091, 0.909), abs=0.002)
+    both, single, none = rows["gm1_backward"].values["shares"]
+    assert (both, single) == pytest.approx((0.091, 0.909), abs=0.002)
     assert none == 0.0
 
 

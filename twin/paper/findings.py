@@ -273,8 +273,8 @@ def measure_contact_shares(
         frequency_hz, case.acceleration, state, FLIGHT_CYCLES, FLIGHT_SAMPLES
     )
     contacts = (motion.force_r > 0).astype(int) + (motion.force_l < 0)
-    both, one, none = (float((contacts == count).mean()) for count in (2, 1, 0))
-    return both, one, none
+    both, single, none = (float((contacts == count).mean()) for count in (2, 1, 0))
+    return both, single, none
 
 
 @dataclass(frozen=True, slots=True)

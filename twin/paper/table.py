@@ -815,11 +815,11 @@ def _find_backward_contact(study: PaperStudy) -> ModelFinding | None:
     if hz is None:
         return None
     shares = findings.measure_contact_shares(case, study.slow_sweeps["G-1"], hz, "backward")
-    both, one, none = shares
+    both, single, none = shares
     return ModelFinding(
         f"in contact with both bumpers for {100 * both:.2f} % of the time, with one for "
-        f"{100 * one:.2f} %, with none for {100 * none:.2f} %",
-        _judge(both > 0 and one > 0 and none == 0),
+        f"{100 * single:.2f} %, with none for {100 * none:.2f} %",
+        _judge(both > 0 and single > 0 and none == 0),
         {"shares": [*shares]},
         hz,
     )
