@@ -21,7 +21,12 @@ from twin.paper.slow_passage import (
     choose_effort,
 )
 from twin.results.paper_cases import PaperCase
-from twin.results.players import HarmonicSimulator, make_simulator
+from twin.results.players import (
+    FINE_SAMPLES_PER_CYCLE,
+    HarmonicSimulator,
+    SystemMotion,
+    make_simulator,
+)
 
 MIN_GAP_MM, GAP_TOLERANCE_MM = (
     -40.0,
@@ -163,16 +168,22 @@ def steady_amplitude_m(
     case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str
 ) -> float:
     """Return the largest u in m of the steady motion reached in one sweep direction."""
-    state = settle_state(case, sweep, frequency_hz, direction)
-    motion = case.simulator.sweep([frequency_hz], case.acceleration, 1, state)
-    return float(motion.column("u_max")[0, -1])
+    return float(simulate_steady_motion(case, sweep, frequency_hz, direction, 1).u.max())
 
 
-def settle_state(case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str) -> Float1D:
-    """Return the state of the steady motion reached in one sweep direction."""
+def simulate_steady_motion(
+    case: PaperCase,
+    sweep: SlowSweep,
+    frequency_hz: float,
+    direction: str,
+    cycles: int,
+    samples: int = FINE_SAMPLES_PER_CYCLE,
+) -> SystemMotion:
+    """Simulate the steady motion that slow passage in this direction leads to."""
+    a, simulator = case.acceleration, case.simulator
     start = sweep.state_at(frequency_hz, direction)
-    simulator = case.simulator
-    return simulator.sweep([frequency_hz], case.acceleration, SETTLE_CYCLES, start).states[0]
+    state = simulator.sweep([frequency_hz], a, SETTLE_CYCLES, start).states[0]
+    return simulator.simulate_motion(frequency_hz, a, state, cycles, samples)
 
 
 def find_permanent_contact_mm(case: PaperCase) -> float:
@@ -268,10 +279,7 @@ def measure_contact_shares(
     case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str
 ) -> tuple[float, float, float]:
     """Return the shares of the time in contact with both bumpers, one, none, in steady motion."""
-    state = settle_state(case, sweep, frequency_hz, direction)
-    motion = case.simulator.simulate_motion(
-        frequency_hz, case.acceleration, state, FLIGHT_CYCLES, FLIGHT_SAMPLES
-    )
+    motion = simulate_steady_motion(case, sweep, frequency_hz, direction, 1, FLIGHT_SAMPLES)
     contacts = (motion.force_r > 0).astype(int) + (motion.force_l < 0)
     both, single, none = (float((contacts == count).mean()) for count in (2, 1, 0))
     return both, single, none

@@ -24,14 +24,13 @@ from twin.drawing.plot_style import (
     experiment_style,
     format_minus,
 )
-from twin.paper.findings import find_coexisting_orbits
+from twin.paper.findings import find_coexisting_orbits, simulate_steady_motion
 from twin.paper.study import COEXISTING_HZ, PaperStudy
 from twin.results.measured_campaign import MeasuredCampaign
 from twin.results.paper_cases import PaperCase
 from twin.results.players import SystemMotion
 from twin.results.report_data import DIRECTIONS
 
-LOOP_SETTLE_CYCLES = 200  # cycles until the drawn motion is steady
 PAPER_RESONANCE_HZ = {"G4": 3.4, "G0": 4.8, "G-1": 6.0, "G-2": 7.3, "G-10": 7.6}
 HISTORY_CYCLES = 3
 ZOOM_MM = 3.4
@@ -68,17 +67,6 @@ def draw_paper_loop_figures(
     yield _draw_loops(study, [resonances[name] for name in ("G-2", "G-10")], ("8", "fig08_loops"))
 
 
-def simulate_steady_motion(
-    study: PaperStudy, name: str, hz: float, direction: str, cycles: int
-) -> SystemMotion:
-    """Simulate the steady motion that slow passage in this direction leads to."""
-    case = study.cases[name]
-    initial_state = study.slow_sweeps[name].state_at(hz, direction)
-    a = case.acceleration
-    state = case.simulator.sweep([hz], a, LOOP_SETTLE_CYCLES, initial_state).states[0]
-    return case.simulator.simulate_motion(hz, a, state, cycles)
-
-
 def _simulate_resonance(study: PaperStudy, name: str) -> ResonantMotions:
     """Simulate a gap at 3.4 Hz (G4), in the middle of its hysteresis, or at the peak of eta_d."""
     fold = study.folds[name]
@@ -88,7 +76,9 @@ def _simulate_resonance(study: PaperStudy, name: str) -> ResonantMotions:
     elif fold is not None:
         hz = round((fold.forward_hz + fold.backward_hz) / 2, 3)
     motions = {
-        direction: simulate_steady_motion(study, name, hz, direction, HISTORY_CYCLES)
+        direction: simulate_steady_motion(
+            study.cases[name], study.slow_sweeps[name], hz, direction, HISTORY_CYCLES
+        )
         for direction in DIRECTIONS
     }
     return ResonantMotions(study.cases[name], hz, motions)
@@ -110,7 +100,7 @@ def _draw_gap_comparison(study: PaperStudy) -> CaptionedFigure:
     for name, case in study.cases.items():
         index, direction = study.slow_sweeps[name].peak
         hz = float(study.slow_sweeps[name].frequency[index])
-        motion = simulate_steady_motion(study, name, hz, direction, 1)
+        motion = simulate_steady_motion(case, study.slow_sweeps[name], hz, direction, 1)
         style: LineStyle = {"color": GAP_COLOURS[name], "lw": 1.4}
         for ax in (mass_ax, insets[0]):
             plot_inertia_loop(ax, motion, case.parameters.mass, True, **style)

@@ -13,7 +13,6 @@ from twin.model.config import ModelConfig
 from twin.paper.force_loops import draw_paper_loop_figures
 from twin.paper.frequency_figures import draw_chaos_figure, draw_frequency_figures
 from twin.paper.secondary_resonances import draw_secondary_resonance_figure
-from twin.paper.sketches import draw_sketches
 from twin.paper.study import PaperStudy
 from twin.paper.table import VERDICTS, ComparisonRow, count_causes
 from twin.results.contract import format_json
@@ -21,7 +20,7 @@ from twin.results.measured_campaign import MeasuredCampaign
 from twin.setup.run_config import read_model
 
 PAPER_MODEL = "snm"
-FIGURE_ORDER = ("2", "3", "4", "5", "6", "7", "8", "9", "10", "11", "12", "")
+FIGURE_ORDER = ("2", "3", "5", "6", "7", "8", "9", "11", "12", "")
 ProgressReporter = Callable[[str], None]
 
 
@@ -40,7 +39,6 @@ def _draw_in_order(study: PaperStudy, campaign: MeasuredCampaign | None) -> Capt
         figure
         for draw in (
             _draw_prc_families,
-            draw_sketches,
             draw_paper_loop_figures,
             draw_secondary_resonance_figure,
             draw_frequency_figures,

@@ -343,11 +343,8 @@ def _find_softening_in_all(study: PaperStudy) -> ModelFinding | None:
     hz, case = _middle_of_softening(study), study.cases["G-1"]
     if hz is None:
         return None
-    sweep, simulator = study.slow_sweeps["G-1"], case.simulator
-    motions = []
-    for direction in DIRECTIONS:
-        state = findings.settle_state(case, sweep, hz, direction)
-        motions.append(simulator.simulate_motion(hz, case.acceleration, state, 4))
+    sweep = study.slow_sweeps["G-1"]
+    motions = [findings.simulate_steady_motion(case, sweep, hz, d, 1) for d in DIRECTIONS]
     differences = _compare_quantities(motions, case)
     return ModelFinding(
         f"forward and backward differ at {hz:.3f} Hz {_format_quantities(differences)}",
