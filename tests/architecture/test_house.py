@@ -29,7 +29,6 @@ OWNERS = {  # packages that may import a foreign library
     "opendaq": ("table_io/backends/opendaq", "table_io/sim"),
     "openpyxl": ("table_io/formats",),
     "pyarrow": ("table_io/formats",),
-    "pythonfmu3": ("twin/exchange",),
     "pyuff": ("table_io/formats",),
     "rerun": ("twin/viewer",),
     "segno": ("twin/system",),
