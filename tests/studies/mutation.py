@@ -58,7 +58,10 @@ TARGETS = {
         ("tests/table_io/safety/test_consistency.py",),
     ),
     "protection": Target(
-        ("table_io/safety/protection/*.py",),
+        tuple(
+            f"table_io/safety/{name}.py"
+            for name in ("protection", "sample_checks", "cycle_checks", "findings")
+        ),
         tuple(
             f"tests/table_io/safety/test_{name}.py"
             for name in ("consistency", "sample_checks", "cycle_checks", "protection")
@@ -73,6 +76,29 @@ TARGETS = {
     ),
     "limits": Target(
         ("table_io/safety/preflight.py",), ("tests/table_io/safety/test_preflight.py",)
+    ),
+    "checks": Target(
+        ("table_io/safety/loop_check*.py", "table_io/safety/wiring_check.py"),
+        tuple(
+            f"tests/table_io/safety/test_{name}.py"
+            for name in ("loop_check", "wiring_check", "tap_test", "digital_inputs")
+        ),
+    ),
+    "config": Target(
+        ("table_io/config/*.py", "table_io/config/excitation/*.py"),
+        ("tests/table_io/config/test_*.py", "tests/table_io/excitation/test_*.py"),
+    ),
+    "sim": Target(
+        ("table_io/sim/*.py",),
+        tuple(
+            f"tests/table_io/sim/test_{name}.py"
+            for name in ("plant", "hidden_plant", "laboratory", "faults", "filters", "ground_truth")
+        )
+        + ("tests/table_io/sim/test_imperfections.py", "tests/table_io/sim/test_*_table.py"),
+    ),
+    "backends": Target(
+        ("table_io/backends/*.py", "table_io/backends/udp/*.py", "table_io/backends/machine/*.py"),
+        ("tests/table_io/backends/test_*.py",),
     ),
     "tracking": Target(
         tuple(f"table_io/control/{name}.py" for name in ("order_tracking", "amplitude_control")),
@@ -418,6 +444,8 @@ def study_package(name: str, count: int, seed: int, only: str) -> int:
         [file for part in parts for file in sorted(REPOSITORY.glob(part))]
         for parts in (target.tests, target.files)
     )
+    assert files, f"{name}: no file is named {' or '.join(target.files)}"
+    assert tests, f"{name}: no file is named {' or '.join(target.tests)}"
     options = ["-x", "-q", "-s", "-n", "0", "-p", "no:cacheprovider", "--benchmark-disable"]
     options += ["-o", "addopts=-m 'not slow'"]
     study = Study(name, files, count, seed, only)
