@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import PROFILES_DIR, format_toml, parse_toml
 from table_io.config.profile import Specimen
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop
 from table_io.sim.ground_truth import EFFECT_DEFINITIONS

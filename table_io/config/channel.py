@@ -21,8 +21,7 @@ from typing import Literal, NamedTuple
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
-from table_io.config.base import ConfigModel, Finite
-from table_io.config.toml_text import format_toml
+from table_io.config.base import ConfigModel, Finite, format_toml
 from table_io.errors import InputError, suggest
 
 NAME_PATTERN = r"[a-z][a-z0-9]*(_[a-z0-9]+)+"

@@ -28,8 +28,15 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo, field_validator
 
 from table_io.channels import CHANNEL_BY_NAME, Channel
-from table_io.config.base import ConfigModel, Count, Finite, NonNegative, Positive, require_both
-from table_io.config.toml_text import format_toml
+from table_io.config.base import (
+    ConfigModel,
+    Count,
+    Finite,
+    NonNegative,
+    Positive,
+    format_toml,
+    require_both,
+)
 from table_io.errors import InputError
 from table_io.units import UNITS
 

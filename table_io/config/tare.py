@@ -13,8 +13,7 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float2D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
-from table_io.config.base import ConfigModel, Finite, NonNegative
-from table_io.config.toml_text import format_toml
+from table_io.config.base import ConfigModel, Finite, NonNegative, format_toml
 from table_io.errors import InputError
 
 MAX_TARE_AGE_H = 168.0  # a week: load cells and amplifiers drift with temperature and cables

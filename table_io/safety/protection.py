@@ -26,8 +26,7 @@ import numpy as np
 
 from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.config.excitation import History, history_acceleration
-from table_io.config.limits import NOTCH
-from table_io.config.profile import Profile
+from table_io.config.profile import NOTCH, Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_transfer
 from table_io.excitation.drive import Drive

@@ -26,8 +26,7 @@ from table_io.adaptive.result import Decision, StepResult, mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import relative_displacement
 from table_io.config.excitation.continuation import Continuation
-from table_io.config.limits import check_limited_channels
-from table_io.config.profile import Profile
+from table_io.config.profile import Profile, check_limited_channels
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
 from table_io.control.order_tracking import HARMONIC_COUNT, HarmonicFit, track_harmonics

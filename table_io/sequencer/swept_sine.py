@@ -17,7 +17,7 @@ import numpy as np
 
 from table_io.block import Label, join_blocks
 from table_io.config.excitation.swept_sine import MAX_DWELLS, SweptSine
-from table_io.config.limits import NOTCH, LimitConfig
+from table_io.config.profile import NOTCH, LimitConfig
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_gain, track_channels, track_harmonics
 from table_io.control.sweep_control import (

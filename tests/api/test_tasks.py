@@ -9,9 +9,8 @@ from typing import Any
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import PROFILES_DIR, format_toml
 from table_io.config.provenance import Provenance
-from table_io.config.toml_text import format_toml
 from tests.builders.rigs import read_model_text
 from tests.command_line import call_main
 from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import pytest
 
-from twin.campaign import command, offline, realtime, state
+from twin.campaign import command, players, state
 from twin.campaign.command import CampaignOptions
 from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.campaign.state import read_state
@@ -124,12 +124,12 @@ def prepare_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder, with a campaign of three runs; nothing is simulated or drawn in it."""
     write(tmp_path, free="inf", g4="4.0")
     (tmp_path / "c.toml").write_text(LISTED)
-    monkeypatch.setattr(offline, "WorkerPool", Players)
+    monkeypatch.setattr(players, "WorkerPool", Players)
     monkeypatch.setattr(Players, "ends", {})
     monkeypatch.setattr(Players, "given", [])
-    for room in (command, realtime):
+    for room in (command, players):
         monkeypatch.setattr(room, "write_campaign_report", write_bare_summary)
-    for room in (offline, realtime):
+    for room in (players,):
         monkeypatch.setattr(room, "format_run_end", lambda *_: "ended")
     monkeypatch.setattr(command, "compile_kernels", lambda *_, **__: None)
     monkeypatch.setattr(state, "LOCK_TIMEOUT_S", 0.1)

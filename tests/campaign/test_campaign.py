@@ -151,9 +151,8 @@ def test_campaign_warns_of_a_new_calibration_record_and_goes_on(
         card.replace("60.0", "50.0") + RECORDED,
         card + RECORDED + '[[sensors]]\nchannel = "table_acc_m_s2"\n',
     ):
-        with pytest.raises(InputError) as error:
+        with raises_input_error(where=str(tmp_path)):
             require_unchanged(tmp_path, plan(text))
-        assert error.value.where == str(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -188,9 +187,8 @@ def test_a_folder_with_content_is_refused_unless_it_is_resumed(folder: Path) -> 
         run_campaign(make_options(folder, resume=True, out=folder / "nowhere"))
     (folder / "other").mkdir()
     (folder / "other" / "mine.txt").write_text("mine")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=str(folder / "other")):
         run_campaign(make_options(folder, resume=True, out=folder / "other"))
-    assert error.value.where == str(folder / "other")
 
 
 def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(

@@ -94,7 +94,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     (folder / "c.toml").write_text(LISTED)
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("twin.campaign.offline.WorkerPool", Here)
+        patch.setattr("twin.campaign.players.WorkerPool", Here)
         patch.setattr(state, "write_report", lambda *_: None)
         patch.setattr(report, "draw_campaign_figures", lambda *_: [])
         assert (

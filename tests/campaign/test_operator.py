@@ -17,7 +17,7 @@ from tests.campaign.campaigns import (
     statuses,
 )
 from tests.input_errors import raises_input_error
-from twin.campaign import command, realtime
+from twin.campaign import command, players
 from twin.campaign.command import run_campaign
 from twin.campaign.state import read_state
 
@@ -48,7 +48,7 @@ def attended_campaign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         record(spec)
         return 0 if book.finish_recording(run) else 3
 
-    monkeypatch.setattr(realtime, "_play_run", play)
+    monkeypatch.setattr(players, "_play_run", play)
     monkeypatch.setattr("sys.stdin.isatty", lambda: True, raising=False)
     monkeypatch.setattr(command, "check_realtime", lambda *_: None)
     return folder

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.records import Agreement, Event
 from table_io.sim.imperfections import Level, draw_laboratory
 from tests.compare.test_monitoring import EFFECT, monitor_session, warnings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import check_limits
 from tests.discovery.played import idealize

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from table_io.config.base import parse_toml
+from table_io.config.base import format_toml, parse_toml
 from table_io.config.excitation import History
 from table_io.config.profile import Specimen, load_profile
 from table_io.config.provenance import HashedFile, Provenance, seal_text
 from table_io.config.rig import RigConfig
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.safety.preflight import list_setup_warnings
 from tests.builders.rigs import read_model_text, read_rig_text
@@ -20,8 +19,7 @@ from tests.command_line import call_main
 from tests.earthquakes.test_table_drive import RECORD, TWIN
 from twin.earthquakes.result import DriveResult, load_table_twin
 from twin.earthquakes.task import TableDriveOptions, TableTwinOptions, compute_drive, identify_table
-from twin.setup.run_config import read_run_config
-from twin.setup.warnings import list_specimen_changes
+from twin.setup.run_config import list_specimen_changes, read_run_config
 from twin.system.files import hash_file
 
 RIG_TOML = read_rig_text("hydraulic")

@@ -10,6 +10,7 @@ from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
 from tests.command_line import call_main
+from tests.input_errors import raises_input_error
 from twin.earthquakes import task
 from twin.earthquakes.result import load_table_twin
 from twin.earthquakes.table_model import TableModel, TableParameters
@@ -159,18 +160,16 @@ def test_a_drive_that_does_not_fit_is_refused(folder: Path, text: str, key: str)
     (folder / "driven.toml").write_text(driven)
     profile = load_profile(folder / "driven.toml")[0]
     assert isinstance(profile.excitation, History)
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key=key):
         _ = profile.plan
-    assert error.value.key == key
 
 
 def test_a_drive_is_not_played_for_another_level(folder: Path) -> None:
     assert compute(folder) == 0
     path = folder / "out" / "profile.toml"
     path.write_text(path.read_text().replace("rms_g = 0.03", "rms_g = 0.06"))
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="excitation.drive"):
         _ = load_profile(path)[0].plan
-    assert error.value.key == "excitation.drive"
 
 
 def test_a_drive_beyond_the_limits_is_not_written_as_ready(folder: Path) -> None:

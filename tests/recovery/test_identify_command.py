@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.records import RunStop
 from tests.builders.rigs import RIG_TEXT, read_model_text
 from tests.recovery.recordings import CHANNELS, TRUTH, card, make_noisy_blocks

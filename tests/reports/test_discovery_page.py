@@ -32,9 +32,8 @@ from twin.drawing.page import format_significant
 from twin.laws.typesetting import typeset_law
 from twin.model.config import ModelConfig
 from twin.model.inverse_dynamics import forces_along
-from twin.setup.run_config import read_model_template, read_run_config
+from twin.setup.run_config import list_model_warnings, read_model_template, read_run_config
 from twin.setup.unpaced import play_unpaced
-from twin.setup.warnings import list_model_warnings
 
 HARDENING_N_M2 = 4.0e7  # N/m2
 SHORT = """

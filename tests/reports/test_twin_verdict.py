@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import seal_truth

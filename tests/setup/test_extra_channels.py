@@ -10,10 +10,10 @@ from typer.testing import CliRunner
 
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from table_io.formats import read_table
 from table_io.records import Comparison
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
+from tests.input_errors import raises_input_error
 from tests.viewer.example_run import scalars
 from twin.cli.table import app
 from twin.compare import COMPARED_CHANNELS
@@ -132,9 +132,8 @@ def test_export_of_declared_channels_is_imported_again(run: Path, lab: Path, kin
     back = lab / f"{kind}.mcap"
     test = ("--profile", lab / "tests/short.toml")
     if kind == "csv":
-        with pytest.raises(InputError) as caught:
+        with raises_input_error(problem=SECOND_ACC):
             import_table(lab / "out.csv", back, ImportOptions(profile=test[1], rig="simulated"))
-        assert SECOND_ACC in caught.value.problem
         shaketwin("import", lab / "out.csv", "-o", back, *test)
     else:  # carries units and the rig file
         units = [table.columns[name].unit for name in EXTRA]

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from table_io.errors import InputError
 from table_io.records import (
     Comparison,
     CycleExtremes,
@@ -20,6 +19,7 @@ from table_io.records import (
     RunStop,
     SampleGap,
 )
+from tests.input_errors import raises_input_error
 from twin.compare.twins import HISTORY_S
 from twin.recording.reader import Recording, read_recording
 from twin.results.contracts import HysteresisInterval, Jump
@@ -263,7 +263,6 @@ def test_a_table_that_is_not_simulated_cannot_be_unpaced(tmp_path: Path) -> None
     (tmp_path / "quick.toml").write_text(QUICK)
     bundle = read_run_config(tmp_path / "quick.toml")
     real = replace(bundle, rig=bundle.rig.model_copy(update={"backend": "machine"}))
-    with pytest.raises(InputError) as raised:
+    with raises_input_error(where="--speed max"):
         play_unpaced(real, "quick", tmp_path / "run.mcap", lambda: None, lambda item: None)
-    assert raised.value.where == "--speed max"
     assert not (tmp_path / "run.mcap").exists()

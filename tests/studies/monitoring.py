@@ -16,8 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from table_io.block import Block
-from table_io.config.base import PROFILES_DIR
-from table_io.config.toml_text import format_toml
+from table_io.config.base import PROFILES_DIR, format_toml
 from table_io.records import Event, Record
 from table_io.sim.imperfections import Level, draw_laboratory
 from tests.builders.truths import hide_truth

@@ -92,9 +92,8 @@ TARGETS = {
         ("table_io/sim/*.py",),
         tuple(
             f"tests/table_io/sim/test_{name}.py"
-            for name in ("plant", "hidden_plant", "laboratory", "faults", "filters", "ground_truth")
-        )
-        + ("tests/table_io/sim/test_imperfections.py", "tests/table_io/sim/test_*_table.py"),
+            for name in ("*plant", "*_table", "laboratory", "faults", "filters", "ground_truth")
+        ),
     ),
     "backends": Target(
         ("table_io/backends/*.py", "table_io/backends/udp/*.py", "table_io/backends/machine/*.py"),

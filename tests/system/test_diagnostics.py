@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.system.diagnostics import LEVEL_VARIABLE, LEVELS, configure_logging
 
 LOG = logging.getLogger("twin.live.test")
@@ -58,7 +58,5 @@ def test_only_errors_are_logged_unless_asked_for(
 
 def test_an_unknown_level_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(LEVEL_VARIABLE, "loud")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key=LEVEL_VARIABLE, value="loud", allowed="debug"):
         configure_logging("rig")
-    assert (error.value.key, error.value.value) == (LEVEL_VARIABLE, "loud")
-    assert "debug" in error.value.allowed

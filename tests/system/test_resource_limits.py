@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.cli import entry
 from twin.system.resource_limits import MIN_OPEN_FILES, WANTED_OPEN_FILES, require_open_files
 
@@ -76,9 +76,8 @@ def test_open_files_are_raised_as_far_as_they_are_allowed(
     monkeypatch.setattr(resource, "getrlimit", lambda _: limits)
     monkeypatch.setattr(resource, "setrlimit", lambda _, pair: limits_set.append(pair))
     if raised_to == "refused":
-        with pytest.raises(InputError) as error:
+        with raises_input_error(key="ulimit -n", value=limits[1]):
             require_open_files()
-        assert (error.value.key, error.value.value) == ("ulimit -n", limits[1])
     else:
         require_open_files()
         assert limits_set == ([] if raised_to is None else [(raised_to, limits[1])])

@@ -4,7 +4,7 @@ import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.errors import InputError
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.system.files import replace_text

@@ -13,8 +13,7 @@ from table_io.config.calibration import find_overdue_calibrations
 from table_io.errors import InputError
 from twin.campaign.config import list_campaign_warnings, read_plan
 from twin.campaign.messages import print_gap_comparison
-from twin.campaign.offline import play_offline
-from twin.campaign.realtime import play_realtime
+from twin.campaign.players import play_offline, play_realtime
 from twin.campaign.report import write_campaign_report
 from twin.campaign.result import CampaignSummary
 from twin.campaign.state import (

@@ -13,11 +13,18 @@ from typing import Any
 
 from pydantic import Field, field_validator
 
-from table_io.config.base import Finite, Number, Positive, list_duplicates, parse_toml, read_text
+from table_io.config.base import (
+    Finite,
+    Number,
+    Positive,
+    format_toml,
+    list_duplicates,
+    parse_toml,
+    read_text,
+)
 from table_io.config.excitation.record import RecordedHistory, SeriesKeys
 from table_io.config.excitation.waveform import Baseline
 from table_io.config.profile import Profile, attach_files, load_profile
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 from twin.model.config import ModelConfig
 from twin.setup.run_config import RunConfig, build_run_config

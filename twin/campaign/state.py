@@ -12,10 +12,9 @@ from pydantic import ValidationError
 
 from table_io.adaptive.policy import make_policy
 from table_io.clock import RealClock, local_datetime
-from table_io.config.base import ConfigModel
+from table_io.config.base import ConfigModel, format_toml
 from table_io.config.profile import Profile, ResumeConfig, SetUpConfirmation
 from table_io.config.rig_file import load_rig
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.campaign import STATE_FILE
 from twin.campaign.config import CampaignPlan, PlannedRun, ResumeMode

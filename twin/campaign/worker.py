@@ -1,6 +1,6 @@
 """Worker process that plays runs at maximum speed; JSON lines: `ProcessConfig` in, events out.
 
-`offline.py` starts it in its own session. SIGTERM or the death of the parent process brings the
+`players.py` starts it in its own session. SIGTERM or the death of the parent process brings the
 table to rest and ends the run. It holds the campaign's lock as long as it lives.
 """
 

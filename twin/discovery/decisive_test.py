@@ -16,12 +16,11 @@ from typing import Any
 import numpy as np
 
 from table_io.block import Block, Label
-from table_io.config.base import parse_toml
+from table_io.config.base import format_toml, parse_toml
 from table_io.config.excitation import MIN_BLEND_CYCLES
 from table_io.config.folders import find_config
 from table_io.config.profile import Profile
 from table_io.config.rig_file import load_rig
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.records import RunStart, Step
 from table_io.safety.preflight import CORRECTION_HEADROOM, check_limits

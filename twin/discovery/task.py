@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from table_io.clock import RealClock
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 from table_io.errors import InputError
 from twin.discovery.build_verdict import (
     build_interval,

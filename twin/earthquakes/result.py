@@ -8,11 +8,17 @@ from pathlib import Path
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D
-from table_io.config.base import ConfigModel, Finite, NonNegative, Positive, load_config
+from table_io.config.base import (
+    ConfigModel,
+    Finite,
+    NonNegative,
+    Positive,
+    format_toml,
+    load_config,
+)
 from table_io.config.excitation.drive_file import format_drive
 from table_io.config.profile import Profile
 from table_io.config.provenance import Provenance, require_seal, seal_text
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError, suggest
 from twin.earthquakes.table_effects import EFFECT_BY_ID, EffectDiscovery
 from twin.earthquakes.table_identification import TableIdentification, TableRehearsal

@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Float1D
-from table_io.config.base import read_text
+from table_io.config.base import format_toml, read_text
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.folders import resolve_config
 from table_io.config.profile import Profile, load_profile
-from table_io.config.toml_text import format_toml
 from table_io.config.tracking import RequiredSpectrum, parse_required_spectrum
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2

@@ -17,8 +17,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from table_io.config.base import ConfigModel, Finite
-from table_io.config.toml_text import format_toml
+from table_io.config.base import ConfigModel, Finite, format_toml
 from twin.laws.checks import ID_PATTERN
 from twin.laws.effect import Effect, EffectParameter, State
 from twin.laws.library import check_new_effect

@@ -12,10 +12,9 @@ from twin.security.credentials import Credentials, credentials_folder
 from twin.setup.disk import require_disk_space
 from twin.setup.folders import RUNS_FOLDER, make_run_folder
 from twin.setup.realtime import check_full_speed, check_realtime
-from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.run_config import RunConfig, list_test_warnings, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.setup.warm_up import compile_kernels
-from twin.setup.warnings import list_test_warnings
 from twin.system.progress import RunProgress
 from twin.system.terminal import catch_interrupts, console, print_line, show_status
 from twin.transport.endpoint import check_endpoint

@@ -11,13 +11,13 @@ from table_io.config.base import (
     Finite,
     NonNegative,
     Positive,
+    format_toml,
     list_duplicates,
     parse_toml,
     read_text,
 )
 from table_io.config.profile import Specimen
 from table_io.config.provenance import Provenance
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from twin.laws.effect import Effect
 from twin.laws.effect_file import EffectFile

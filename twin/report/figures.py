@@ -13,7 +13,6 @@ from twin.drawing.branch_curves import (
     plot_branches,
 )
 from twin.drawing.motion_drawing import draw_rest_lines
-from twin.drawing.orbit_figure import draw_orbits
 from twin.drawing.panels import CaptionedFigure, CaptionedFigures, FigurePanel, Key, PanelFigure
 from twin.drawing.plot_style import (
     DIRECTION_COLOURS,
@@ -41,6 +40,7 @@ from twin.drawing.run_figures import (
     draw_histories,
     draw_legend,
     draw_loop_figures,
+    draw_orbits,
     draw_swept_sine,
     draw_window_histories,
 )

@@ -32,8 +32,7 @@ from twin.results.tracking import find_band, find_record_error
 from twin.rig.predicted_ranges import PredictedPeak, format_clipping_warnings, predict_response
 from twin.setup.disk import planned_bytes
 from twin.setup.folders import make_output_folder
-from twin.setup.run_config import RunConfig, make_run_id, read_run_config
-from twin.setup.warnings import list_test_warnings
+from twin.setup.run_config import RunConfig, list_test_warnings, make_run_id, read_run_config
 from twin.system.terminal import console, print_line, print_table
 
 MAX_FILTER_ERROR = 0.02  # rms, of a record by the filter of its profile, in the judged band

@@ -1,4 +1,7 @@
-"""Configuration of a run: profile, rig, model and drive, validated together beforehand."""
+"""Configuration of a run: profile, rig, model and drive, validated together beforehand.
+
+Warnings of a test are listed for it too: `run` and `check` show the same ones.
+"""
 
 import platform
 from collections.abc import Callable
@@ -10,7 +13,7 @@ from table_io.acquisition.session import SessionSetup
 from table_io.backends import open_backend
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.base import PROFILES_DIR, parse_toml
-from table_io.config.calibration import check_tare
+from table_io.config.calibration import check_tare, find_overdue_calibrations
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, Specimen, load_profile
 from table_io.config.rig import RigConfig
@@ -20,7 +23,14 @@ from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.records import RunStart, Step
 from table_io.safety.loop_check_data import PreloadLimits
-from table_io.safety.preflight import StepDemand, check_drive_rig, check_limits, compute_demands
+from table_io.safety.preflight import (
+    StepDemand,
+    check_drive_rig,
+    check_limits,
+    compute_demands,
+    list_drive_warnings,
+    list_setup_warnings,
+)
 from table_io.sensor_errors import highpass
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.model.config import ModelConfig, load_model_config
@@ -313,3 +323,32 @@ def read_model_template(name: str) -> tuple[Model, ModelConfig]:
     """
     config, _ = read_model(name, option="--model")
     return config.build_model(Specimen(mass_kg=1.0, gap_mm=float("inf"))), config
+
+
+def list_test_warnings(config: RunConfig) -> list[str]:
+    """List what is doubtful of a test: its drive, set-up, model, and sensors out of calibration."""
+    return [
+        *list_drive_warnings(config.margins, config.rig),
+        *list_setup_warnings(config.profile, config.rig),
+        *list_model_warnings(config.model_toml),
+        *list_specimen_changes(config.model_toml, config.profile.specimen),
+        *find_overdue_calibrations(config.rig, local_datetime().date()),
+    ]
+
+
+def list_model_warnings(model_toml: str) -> list[str]:
+    """Return a warning for a model that its fit marked as provisional."""
+    model = parse_toml(model_toml, ModelConfig, "model")
+    return [f"the model is provisional: {model.provisional}"] if model.provisional else []
+
+
+def list_specimen_changes(model_toml: str, specimen: Specimen) -> list[str]:
+    """List how a specimen differs from those that a model was identified from."""
+    model = parse_toml(model_toml, ModelConfig, "model")
+    if model.provenance is None:
+        return []
+    what, gap_mm = f"the model {model.title!r}", 1e3 * sum(specimen.gaps_m)
+    return [
+        *model.provenance.list_mass_changes(specimen.mass_kg, what),
+        *model.provenance.list_bumper_changes(gap_mm, what),
+    ]

@@ -19,8 +19,7 @@ from table_io.config.excitation.swept_sine import (
     PredictedSweep,
     SweptSine,
 )
-from table_io.config.limits import NOTCH
-from table_io.config.profile import LoopCheckConfig, Profile
+from table_io.config.profile import NOTCH, LoopCheckConfig, Profile
 from table_io.config.rig import RigConfig
 from table_io.control.sweep_control import LIMIT_SHARE
 from table_io.records import RunStart, RunStop, SweepLevel

@@ -12,9 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from table_io.block import Float1D
-from table_io.config.base import ConfigModel, parse_toml
+from table_io.config.base import ConfigModel, format_toml, parse_toml
 from table_io.config.provenance import Provenance, require_seal, seal_text
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 
 HEADER = "drive_mm"

@@ -22,9 +22,9 @@ from table_io.acquisition.session import TARE_S, RunDescriber
 from table_io.backends import Backend, open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
+from table_io.config.base import format_toml
 from table_io.config.calibration import compute_tare, volts_to_si
 from table_io.config.profile import Profile
-from table_io.config.toml_text import format_toml
 from table_io.records import Record, RunStop
 from table_io.sim.imperfections import SIDES, Imperfection, resolve_sides
 from tests.builders.rigs import read_rig_text

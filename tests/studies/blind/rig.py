@@ -18,10 +18,9 @@ import numpy as np
 from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
-from table_io.config.base import PROFILES_DIR, parse_toml
+from table_io.config.base import PROFILES_DIR, format_toml, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.config.toml_text import format_toml
 from table_io.excitation.trajectory import plan_sweep
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.rigs import read_rig_text

@@ -17,11 +17,10 @@ from twin.model.config import ModelConfig
 from twin.model.stepped_sine import validate_frequencies
 from twin.results.contract import Contract
 from twin.setup.run_config import read_model
-from twin.studies.maps.branch_outcomes import BRANCH_OUTCOMES
 from twin.studies.maps.cases import CaseFactory, SampledCase
 from twin.studies.maps.config import StudyConfig
+from twin.studies.maps.outcome_library import BRANCH_OUTCOMES, SWEEP_OUTCOMES
 from twin.studies.maps.outcomes import CURVE_DIMS, ENTRY_POINT_GROUP, Outcome, OutcomeVariable
-from twin.studies.maps.sweep_outcomes import SWEEP_OUTCOMES
 
 
 class StudyDefinition(Contract):

@@ -1,4 +1,7 @@
-"""Play a campaign offline: simulated runs at maximum speed, several in parallel."""
+"""Play the runs of a campaign: in real time one after another, or simulated ones in parallel.
+
+In real time the operator changes the set-up between the runs; simulated ones play at maximum speed.
+"""
 
 import json
 import os
@@ -7,23 +10,32 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
+from table_io.clock import RealClock
+from table_io.errors import InputError
 from twin.campaign.config import PlannedRun
 from twin.campaign.messages import (
+    ask_operator,
     format_run_end,
     format_run_name,
     format_run_start,
     unattended_answer,
 )
-from twin.campaign.state import ActiveCampaign
+from twin.campaign.report import write_campaign_report
+from twin.campaign.state import ActiveCampaign, OperatorAnswer, write_summary_and_report
 from twin.live.process_config import ProcessConfig
+from twin.live.supervisor import Supervisor
+from twin.recording.merge import merge_run_parts
 from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
+from twin.security.credentials import Credentials, credentials_folder
 from twin.system.files import count_cores
+from twin.system.progress import RunProgress
 from twin.system.terminal import catch_interrupts, console, print_line
 
 MAX_WORKERS = 2  # each holds a whole recording in memory while it writes the report
@@ -173,3 +185,68 @@ class WorkerPool:
         )
         self._workers.append(RunWorker(process))
         return self._workers[-1]
+
+
+def play_realtime(
+    campaign: ActiveCampaign, asks: bool, listen: str, keys: Credentials | None
+) -> int:
+    """Play the pending runs; return the exit code. No run starts after one that is incomplete."""
+    confirmed = None if campaign.resumed else ""  # the set-up; None: unknown
+    for run in campaign.pending_runs():
+        print_line(format_run_start(campaign, run))
+        answer = ask_operator(campaign, run, confirmed) if asks else unattended_answer(run.prompt)
+        if answer is None:
+            return EXIT_INTERRUPTED
+        if answer.answer == "skipped":
+            confirmed = None  # the change may have been begun
+            campaign.skip_run(run, answer)
+            continue
+        if answer.answer == "done":
+            confirmed = answer.asked
+        code = _play_run(campaign, run, answer, listen, keys)
+        if code:
+            return code
+        write_campaign_report(campaign.folder)
+    return 0
+
+
+def _play_run(
+    campaign: ActiveCampaign,
+    run: PlannedRun,
+    answer: OperatorAnswer,
+    listen: str,
+    keys: Credentials | None,
+) -> int:
+    """Play a run on the table; return exit code 0 if it is complete."""
+    config = replace(campaign.begin_recording(run, answer, listen), keys=credentials_folder(keys))
+    bundle = config.make_run_config()
+    progress = RunProgress(console, len(bundle.steps), bundle.drive.planned_end)
+    with catch_interrupts() as stop_requested, progress:
+        supervisor = Supervisor(
+            config,
+            bundle.profile.on_death,
+            RealClock(),
+            progress,
+            stop_requested,
+            progress.print_line,
+        )
+        try:
+            began = supervisor.run()
+        except InputError:
+            campaign.discard_recording(run)
+            raise
+    if not began:
+        campaign.discard_recording(run)
+        return EXIT_INTERRUPTED
+    try:
+        merge_run_parts(Path(config.folder))
+        write_summary_and_report(Path(config.folder))
+    except InputError as error:
+        campaign.mark_unreadable(run, str(error))
+        print_line(f"{format_run_name(campaign, run)}: {error}")
+        return EXIT_ABORTED
+    is_complete = campaign.finish_recording(run)
+    print_line(f"{format_run_end(campaign, run)} -> {config.folder}/report.html")
+    if stop_requested():
+        return EXIT_INTERRUPTED
+    return 0 if is_complete else EXIT_ABORTED
