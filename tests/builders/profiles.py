@@ -7,6 +7,14 @@ from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile, Specimen, load_profile
 
 SPECIMEN = Specimen.model_validate({"mass_kg": 550.0, "gap_mm": 4.0})
+RECORD_TOML = """title = "a record"
+[specimen]
+mass_kg = 550.0
+gap_mm = 4.0
+[excitation]
+kind = "record"
+file = "motion.csv"
+"""
 GRID = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 4, "measured_cycles": 2}
 
 

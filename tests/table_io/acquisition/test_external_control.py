@@ -21,6 +21,7 @@ from table_io.excitation.drive import Drive
 from table_io.records import Check, Event, FrequencyResponse, RunStart, RunStop, Trip
 from tests.builders.drives import sine_segments
 from tests.builders.sessions import make_start
+from tests.input_errors import raises_input_error
 from tests.table_io.acquisition.external_controller import Bystander, whole
 
 DRIVE_START_SAMPLE = 4000.37
@@ -256,9 +257,8 @@ def test_stop_while_waiting_ends_at_once() -> None:
 
 def test_test_that_decides_while_it_runs_cannot_be_given_away() -> None:
     profile = load_config(find_config("track", "tests"), Profile, "profile")[0]
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="[track]"):
         plan_open_loop_drive(profile, setup().rig)
-    assert error.value.key == "[track]"
 
 
 class Breaking(Bystander):

@@ -9,9 +9,9 @@ import pytest
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D, Label
 from table_io.config.folders import find_config
-from table_io.errors import InputError
 from table_io.excitation.drive import Drive
 from tests.builders.drives import sine_segments
+from tests.input_errors import raises_input_error
 from tests.table_io.acquisition.external_controller import Bystander, whole
 from tests.table_io.acquisition.test_external_control import (
     DRIVE_START_SAMPLE,
@@ -86,9 +86,8 @@ class Early(Before):
 
 
 def test_controller_that_plays_before_the_start_is_refused() -> None:
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="drive_disp_m"):
         run(setup(), kind=Early)
-    assert error.value.key == "drive_disp_m"
     assert run(setup(), kind=Before).stop.verdict == "complete"
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from table_io.config.folders import find_config
-from table_io.errors import InputError
 from table_io.records import Event
+from tests.input_errors import raises_input_error
 from tests.table_io.backends.separate_processes import own_network
 from twin.recording.reader import read_recording
 from twin.rig.table import ExternalController, serve_table
@@ -79,7 +79,7 @@ def test_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Path)
 
 def test_only_a_followed_table_is_played_by_somebody_else() -> None:
     play = find_config("g0", "tests")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=f"--play {play}"):
         serve_table(
             "simulated",
             None,
@@ -88,7 +88,6 @@ def test_only_a_followed_table_is_played_by_somebody_else() -> None:
             sys.stdout,
             controller=ExternalController(play),
         )
-    assert error.value.where == f"--play {play}"
 
 
 def test_run_without_device_is_refused(tmp_path: Path) -> None:

@@ -7,26 +7,16 @@ import numpy as np
 import pytest
 
 from table_io.acquisition.output_queue import BufferUnderrun, OutputQueue
-from table_io.acquisition.session import SessionSetup, run_session
-from table_io.block import Float1D, Float2D, Label, join_blocks
+from table_io.block import Float1D, Float2D, Label
 from table_io.clock import ManualClock
 from table_io.excitation.drive import Drive
-from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep
-from table_io.records import Event, FrequencyResponse
+from table_io.excitation.trajectory import SineTarget, Trajectory
 from tests.builders.rigs import command_to_si
-from tests.builders.sessions import make_start
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
     RIG,
-    A,
-    Hasty,
     Machine,
-    Stop,
-    Watched,
-    blocks,
     machine,
-    profile,
-    stop_record,
 )
 
 BLOCK_SAMPLES = 20
@@ -56,27 +46,6 @@ def test_queue_that_never_started_has_nothing_to_bring_to_rest() -> None:
     assert (subject.next, subject.clock.now()) == (0, 0.0)
 
 
-def test_drive_is_replaced_at_once_or_nothing_changes() -> None:
-    subject = Hasty(plan_sweep(profile()), ManualClock(), after=4000)
-    queue = start_queue(subject)
-    play(queue, subject, 4000)
-    drive, first = queue.drive, queue.first_changeable()
-    subject.stopping = True
-    decaying = drive.decay_from(first + 500)
-    subject.refused = 1
-    before = (queue.drive, queue._queued_end)
-    assert queue.replace_drive(decaying, first) is False
-    assert (queue.drive, queue._queued_end) == before
-    assert queue.replace_drive(decaying, first) is True
-    assert queue.drive is decaying
-    np.testing.assert_allclose(
-        subject.take_command(0, decaying.rest_start),
-        decaying.command(0, decaying.rest_start),
-        rtol=0,
-        atol=1e-15,
-    )
-
-
 def test_nothing_is_replaced_once_the_lead_has_run_out() -> None:
     subject = machine()
     queue = start_queue(subject)
@@ -92,35 +61,6 @@ def test_nothing_is_replaced_once_the_lead_has_run_out() -> None:
     with pytest.raises(BufferUnderrun, match=f"ended at sample {end}"):
         queue.feed()
     assert queue.drive.decay_start == end
-
-
-def test_tuned_test_plays_every_drive_that_was_decided_on() -> None:
-    """Loop check and amplitude control change the drive on the way; each change is queued."""
-    test = profile(stop_hz=2.5, directions=("forward",))
-    defaults = type(test).model_fields
-    test = test.model_copy(
-        update={
-            name: defaults[name].get_default(call_default_factory=True)
-            for name in ("loop_check", "control")
-        }
-    )
-    table = Watched(test)
-    items: list[Any] = list(
-        run_session(SessionSetup(test, RIG), table, table.clock, make_start, Stop())
-    )
-    whole = join_blocks(blocks(items))
-    assert stop_record(items).verdict == "complete"
-    assert sum(isinstance(item, FrequencyResponse) for item in items) == 1
-    measured = whole.label == Label.MEASURE
-    assert set(whole.step[measured].tolist()) == set(range(len(test.steps)))
-    for step in test.steps:
-        held = measured & (whole.step == step.index)
-        peak = np.sqrt(2.0) * whole.channel("table_acc_m_s2")[held].std()
-        assert peak == pytest.approx(A, rel=0.03)
-    states = [item.text for item in items if isinstance(item, Event) and item.kind == "state"]
-    assert states == ["checking", "armed", "running", "at rest"]
-    running = next(item for item in items if isinstance(item, Event) and item.text == "running")
-    assert 0 <= running.index - int(np.flatnonzero(whole.step >= 0)[0]) <= BLOCK_SAMPLES
 
 
 @dataclass

@@ -336,12 +336,6 @@ class Taring(Machine):
         return volts
 
 
-def test_tare_is_that_of_one_second_at_rest() -> None:
-    subject = Taring(plan_sweep(profile()), ManualClock())
-    list(session(subject, Stop(2)))
-    assert subject.tared == [RATE_HZ]
-
-
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_samples_from_999_thousandths_of_the_range_on_are_clipped(is_reversed: bool) -> None:
     shown = {101: 0.998, 105: 0.999, 110: 1.0, 115: -0.998, 120: -0.999, 125: -1.2}

@@ -23,6 +23,7 @@ from table_io.errors import InputError
 from table_io.sim.machine.table import SIMULATOR_GROUP, find_simulator
 from tests.builders.rigs import read_rig_text
 from tests.command_line import call_main
+from tests.input_errors import raises_input_error
 
 ROOT = Path(__file__).resolve().parents[3]
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
@@ -153,9 +154,8 @@ def test_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path: P
     rig = parse_toml(RIG, RigConfig, "a recording")  # is read all the same
     assert rig.model_extra == {"ideal": {"gain": 1.0}}
     assert not rig.runs_at_any_speed
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(key="backend", value="ideal"):
         find_descriptor(rig)
-    assert (caught.value.key, caught.value.value) == ("backend", "ideal")
 
 
 def test_section_of_a_plugin_is_read_as_strictly_as_ours(site: Path) -> None:
@@ -179,10 +179,8 @@ def test_source_does_not_drive(site: Path, tmp_path: Path) -> None:
     profile = parse_toml(PROFILE, Profile, "two.toml")
     rig = parse_toml(RIG.replace("gain = 1.0", ""), RigConfig, "rig.toml")
     assert not rig.under_external_control
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(key="backend", value="ideal", remedy="follow"):
         open_backend(rig, profile, ManualClock())
-    assert (caught.value.key, caught.value.value) == ("backend", "ideal")
-    assert "follow" in caught.value.remedy
     followed = RIG.replace("gain = 1.0", '[follow]\nsource = "ideal"').replace(
         'backend = "ideal"', 'backend = "follow"'
     )
@@ -205,9 +203,8 @@ def test_recording_that_followed_a_plugin_is_read_without_it(tmp_path: Path) -> 
     assert parse_toml(followed, RigConfig, "a recording").under_external_control
     path = tmp_path / "rig.toml"
     path.write_text(followed)
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(key="[ideal]", value="ideal"):
         load_rig(path)
-    assert (caught.value.key, caught.value.value) == ("[ideal]", "ideal")
 
 
 def test_source_that_drives_is_refused(site: Path) -> None:
@@ -241,9 +238,8 @@ def test_unusable_plugin_is_an_error_of_input(site: Path, module: str, allowed: 
 
 def test_two_packages_with_one_name_are_refused(site: Path) -> None:
     install(site, entry="simulated = ideal_table:BACKEND")
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(where=BACKEND_GROUP, key="simulated"):
         load_backend("simulated")
-    assert (caught.value.where, caught.value.key) == (BACKEND_GROUP, "simulated")
     assert load_backend("udp") is not None
 
 

@@ -21,6 +21,7 @@ from table_io.config.base import parse_toml
 from table_io.config.calibration import volts_to_si
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from tests.table_io.backends.conformance import ACQUIRING, Bench, read_lossy_rig
 from tests.table_io.backends.separate_processes import own_network
 
@@ -94,18 +95,17 @@ def replace_signals(rig: RigConfig, **signals: str) -> RigConfig:
 
 def test_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
     source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="cell_9"), RATE_HZ, bench.clock)
-    with pytest.raises(InputError) as error:
+    with raises_input_error(
+        key="opendaq.signals.force_r1_n", value="cell_9", allowed="/Sig/cell_r1"
+    ):
         source.open()
-    assert (error.value.key, error.value.value) == ("opendaq.signals.force_r1_n", "cell_9")
-    assert "/Sig/cell_r1" in error.value.allowed
     source.close()
 
 
 def test_signal_without_time_stamps_is_refused(bench: Bench) -> None:
     source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="time"), RATE_HZ, bench.clock)
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="opendaq.signals.force_r1_n", value="time"):
         source.open()
-    assert (error.value.key, error.value.value) == ("opendaq.signals.force_r1_n", "time")
     source.close()
 
 

@@ -12,8 +12,8 @@ from table_io.backends.udp.backend import UdpBackend
 from table_io.clock import RealClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from tests.builders.rigs import DECLARED, EXTRA, TEMPERATURE, make_lab_rig
+from tests.input_errors import raises_input_error
 from tests.table_io.backends.ni_wire import CARD, Bed
 from tests.table_io.backends.udp_bench import SPECIMEN, card, python_target
 
@@ -50,9 +50,8 @@ def test_ni_reads_it_at_its_terminals() -> None:
 
 def test_ni_needs_its_terminals() -> None:
     rig = parse_toml(NI_TEXT.replace(WIRES[1], ""), RigConfig, "ni")
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(problem=TEMPERATURE):
         require_ni_wiring(rig)
-    assert TEMPERATURE in caught.value.problem
 
 
 def test_udp_target_sends_it_in_the_order_of_the_sensors(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from table_io.sim.machine import server
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
 from tests.builders.flight_records import read_flight_record
+from tests.input_errors import raises_input_error
 from tests.table_io.sim.test_machine import RATE_HZ, RIG, SPECIMEN, claim
 
 
@@ -91,12 +92,10 @@ def driving(where: str) -> MachineBackend:
 
 
 def test_absent_machine_is_refused_with_a_remedy(tmp_path: Path) -> None:
-    with pytest.raises(InputError) as error:
+    with raises_input_error(remedy=START):
         controller(f"unix/{tmp_path / 'none'}").open()
-    assert START in error.value.remedy
-    with pytest.raises(InputError) as error:
+    with raises_input_error(remedy=START):
         check_reachable(at(f"unix/{tmp_path / 'none'}"))
-    assert START in error.value.remedy
 
 
 def test_check_reachable_claims_nothing(machine: Served) -> None:
@@ -120,9 +119,8 @@ def test_other_server_is_refused() -> None:
 
 def test_controller_at_a_time(machine: Served) -> None:
     first = driving(machine.where)
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=machine.where):
         controller(machine.where).open()
-    assert error.value.where == machine.where
     first.read(200)
     first.close()
 
@@ -230,9 +228,8 @@ def test_endpoint_in_use_is_refused_and_a_dead_one_taken_over(tmp_path: Path) ->
     open_listener(where).close()  # its file was left behind
     with closing(open_listener(parse_endpoint("tcp/127.0.0.1:0"))) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(InputError) as error:
+        with raises_input_error(where=f"--listen tcp/127.0.0.1:{port}"):
             open_listener(parse_endpoint(f"tcp/127.0.0.1:{port}"))
-        assert error.value.where == f"--listen tcp/127.0.0.1:{port}"
 
 
 @pytest.mark.parametrize("key", ["machine", "simulated"])
@@ -243,6 +240,5 @@ def test_card_without_its_table_is_refused(key: str) -> None:
         if key == "machine"
         else (lambda: SimulatedMachine(rig, print))
     )
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key=f"[{key}]"):
         make()
-    assert error.value.key == f"[{key}]"

@@ -16,7 +16,7 @@ from table_io.backends.machine.protocol import (
     encode_message,
     parse_endpoint,
 )
-from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 
 RATE_HZ = 2000.0
 
@@ -128,7 +128,5 @@ def test_landing_ends_for_any_number(x: float) -> None:
     ],
 )
 def test_endpoint_stays_on_this_computer(text: str) -> None:
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="endpoint", value=text, allowed="tcp/127.0.0.1:PORT"):
         parse_endpoint(text)
-    assert (error.value.key, error.value.value) == ("endpoint", text)
-    assert "tcp/127.0.0.1:PORT" in error.value.allowed

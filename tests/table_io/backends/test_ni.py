@@ -26,6 +26,7 @@ from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.sessions import make_start
+from tests.input_errors import raises_input_error
 from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
 
@@ -226,9 +227,8 @@ def test_rig_that_drives_keeps_its_device(bed: Bed) -> None:
         first.read(max(int((when - bed.clock.now()) * RATE_HZ), 1))
 
     second = bed.backend(clock=Paced(bed.clock, waits))
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=f"rig {bed.rig.name}", remedy="end it first"):
         second.open()
-    assert (error.value.where, error.value.remedy) == (f"rig {bed.rig.name}", "end it first")
     first.read(20)
     first.close()
     bed.rest()
@@ -336,13 +336,11 @@ def test_trigger_is_that_of_the_inputs_chassis() -> None:
 
 def test_absent_server_is_refused_with_a_remedy() -> None:
     rig = parse_toml(CARD.replace("127.0.0.1:7470", "127.0.0.1:9"), RigConfig, "card")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(remedy="shaketwin table --table ni_simulated"):
         check_reachable(rig)
-    assert "shaketwin table --table ni_simulated" in error.value.remedy
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(remedy="ni.endpoint"):
         check_reachable(local)
-    assert "ni.endpoint" in error.value.remedy
 
 
 def test_local_driver_is_warned_of() -> None:
@@ -492,6 +490,5 @@ def test_address_in_use_is_refused() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         rig = parse_toml(CARD.replace("127.0.0.1:7470", address), RigConfig, "card")
-        with pytest.raises(InputError) as error:
+        with raises_input_error(key="ni.endpoint", value=address):
             ServerEndpoint(get_wiring(rig))
-        assert (error.value.key, error.value.value) == ("ni.endpoint", address)

@@ -23,6 +23,7 @@ from table_io.errors import InputError
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
+from tests.input_errors import raises_input_error
 from tests.studies.ni import serve_table
 from tests.studies.ni_error_codes import RATE_HZ, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
@@ -120,13 +121,6 @@ def test_open_interlock_is_not_started_against(monkeypatch: pytest.MonkeyPatch) 
     resetting.queue(0, np.zeros(2))
     resetting.start()
     resetting.close()
-
-
-def test_with_all_well_it_starts() -> None:
-    backend = open_backend(Bed(WELL))
-    backend.start()
-    backend.read(20)
-    backend.close()
 
 
 def test_start_whose_answer_is_lost_is_played_to_rest(
@@ -310,6 +304,5 @@ def test_run_ends_before_the_driver_cannot_count_on(monkeypatch: pytest.MonkeyPa
 
 def test_served_card_needs_an_address() -> None:
     local = parse_toml(CARD.replace('endpoint = "127.0.0.1:7470"\n', ""), RigConfig, "card")
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="ni.endpoint"):
         ServerEndpoint(get_wiring(local))
-    assert error.value.key == "ni.endpoint"

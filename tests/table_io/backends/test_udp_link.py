@@ -40,6 +40,7 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.udp.server import UdpTarget, bind_socket, serve_udp_target
+from tests.input_errors import raises_input_error
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     Address,
@@ -214,10 +215,8 @@ def test_rig_at_a_time(target: Served) -> None:
 
 
 def test_port_that_is_taken_is_named(target: Served) -> None:
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="udp.target", value=f"{target.address[0]}:{target.address[1]}"):
         bind_socket(target.address)
-    assert error.value.key == "udp.target"
-    assert error.value.value == f"{target.address[0]}:{target.address[1]}"
 
 
 def test_absent_rig_loses_the_target(target: Served) -> None:

@@ -12,20 +12,13 @@ from table_io.config.excitation.record import RecordedHistory
 from table_io.config.excitation.waveform import correct_baseline, cut_rest, limit_band
 from table_io.config.profile import Profile, load_profile
 from table_io.units import GRAVITY_M_S2
+from tests.builders.profiles import RECORD_TOML
 from tests.input_errors import raises_input_error
 
 RATE_HZ = 200.0
 DURATION_S = 20.0
 TIME_S = np.arange(round(DURATION_S * RATE_HZ)) / RATE_HZ
 W = 2 * np.pi * 1.5
-TEST = """title = "a record"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[excitation]
-kind = "record"
-file = "motion.csv"
-"""
 
 
 def displacement(t: Float1D) -> Float1D:
@@ -100,7 +93,7 @@ def load(folder: Path, more: str = "") -> tuple[Profile, RecordedHistory]:
     rows = zip(TIME_S.tolist(), acceleration(TIME_S).tolist(), strict=True)
     text = "time_s,acc_m_s2\n" + "".join(f"{t:.3f},{a:.9f}\n" for t, a in rows)
     (folder / "motion.csv").write_text(text)
-    (folder / "test.toml").write_text(TEST + more)
+    (folder / "test.toml").write_text(RECORD_TOML + more)
     profile, _ = load_profile(folder / "test.toml")
     assert isinstance(profile.excitation, RecordedHistory)
     return profile, profile.excitation
@@ -139,7 +132,7 @@ def test_displacement_is_filtered_if_a_band_is_set(tmp_path: Path) -> None:
         for t in TIME_S.tolist()
     )
     (tmp_path / "motion.csv").write_text("time_s,disp_mm\n" + rows)
-    (tmp_path / "test.toml").write_text(TEST + "band_hz = [0.2, 5.0]\n")
+    (tmp_path / "test.toml").write_text(RECORD_TOML + "band_hz = [0.2, 5.0]\n")
     plan = load_profile(tmp_path / "test.toml")[0].plan
     assert np.abs(plan.history_m).max() == pytest.approx(5e-3, rel=0.02)  # 1.5 Hz alone
 
@@ -204,6 +197,6 @@ def test_short_record_is_filtered_from_one_cycle_in_its_duration(tmp_path: Path)
 def test_baseline_of_a_displacement_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{t:.3f},{np.sin(t)}\n" for t in TIME_S.tolist())
     (tmp_path / "motion.csv").write_text("time_s,disp_mm\n" + rows)
-    (tmp_path / "test.toml").write_text(TEST + 'baseline = "mean"\n')
+    (tmp_path / "test.toml").write_text(RECORD_TOML + 'baseline = "mean"\n')
     with raises_input_error(key="excitation.file", remedy="remove baseline"):
         load_profile(tmp_path / "test.toml")

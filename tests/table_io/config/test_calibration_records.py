@@ -17,6 +17,7 @@ from table_io.config.rig_file import calibrations_dir, load_rig
 from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calibration_toml
 from table_io.errors import InputError
 from tests.builders.rigs import RIG_TEXT
+from tests.input_errors import raises_input_error
 
 TODAY = date(2026, 3, 10)
 HEAD = 'channel = "table_acc_m_s2"\nunit = "g"\n'
@@ -180,9 +181,8 @@ def test_record_without_a_time_is_refused(path: Path, at: str) -> None:
     put(path, "one.toml", record())
     (file,) = calibrations_dir(path).glob("*.toml")
     file.write_text(file.read_text().replace(record().at, at))
-    with pytest.raises(InputError) as raised:
+    with raises_input_error(where=str(file), key="at") as raised:
         load_rig(path)
-    assert (raised.value.where, raised.value.key) == (str(file), "at")
     assert (raised.value.value, raised.value.allowed[:8]) == (at, "ISO 8601")
 
 
@@ -190,9 +190,8 @@ def test_bad_record_is_named_by_its_own_file(path: Path) -> None:
     put(path, "20260101-000000-table_acc_m_s2.toml", record())
     (file,) = calibrations_dir(path).glob("*.toml")
     file.write_text(file.read_text().replace("offset =", "ofset ="))
-    with pytest.raises(InputError) as raised:
+    with raises_input_error(where=str(file)) as raised:
         load_rig(path)
-    assert raised.value.where == str(file)
     remedies = {fault.key: fault.remedy for fault in raised.value.faults}
     assert remedies["calibrations.0.ofset"] == "did you mean 'offset'?"
 

@@ -5,12 +5,7 @@ from pathlib import Path
 import pytest
 
 from table_io.config.base import PROFILES_DIR
-from table_io.config.folders import (
-    FOLDERS_VARIABLE,
-    find_config,
-    list_configs,
-    resolve_config,
-)
+from table_io.config.folders import FOLDERS_VARIABLE, find_config, list_configs, resolve_config
 from tests.input_errors import raises_input_error
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 from twin.campaign.config import read_plan
 from twin.model.config import load_model_config
 from twin.setup.run_config import read_run_config
@@ -41,7 +42,6 @@ def test_fault_of_an_effect_file_names_the_effect_file(tmp_path: Path) -> None:
     text = (PROFILES_DIR / "models" / "snm.toml").read_text()
     model.write_text(f'{text}\n[[effects]]\nfile = "own.toml"\nparameters = {{ k = 1.0 }}\n')
     (tmp_path / "own.toml").write_text('id = "own"\nforce = "k * w"\n[parameters]\n')
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(where=str(tmp_path / "own.toml")) as caught:
         load_model_config(model)
-    assert caught.value.where == str(tmp_path / "own.toml")
     assert "model.toml" not in str(caught.value)

@@ -14,6 +14,7 @@ from table_io.config.excitation.continuation import (
     unpack_harmonics,
 )
 from table_io.errors import InputError
+from tests.input_errors import raises_input_error
 
 
 def make_plan() -> OrbitPlan:
@@ -64,17 +65,15 @@ def test_harmonics_are_packed_in_the_stated_order() -> None:
 )
 def test_fault_of_a_plan_names_its_key(change: dict, key: str) -> None:
     text = json.dumps(json.loads(make_plan().to_json()) | change)
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(where="plan.json", key=key):
         parse_orbit_plan(text, "plan.json")
-    assert (caught.value.where, caught.value.key) == ("plan.json", key)
 
 
 def test_jacobian_must_fit_the_harmonics() -> None:
     table = json.loads(make_plan().to_json())
     table["points"][1]["jacobian"] = [[1.0]]
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(key="points.1.jacobian"):
         parse_orbit_plan(json.dumps(table), "plan.json")
-    assert caught.value.key == "points.1.jacobian"
 
 
 def test_text_that_is_no_plan_is_refused() -> None:

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 
 from table_io.channels import CHANNEL_BY_NAME
-from table_io.config.base import ConfigModel, load_config, parse_toml
+from table_io.config.base import ConfigModel, format_toml, load_config, parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import SensorConfig
-from table_io.config.toml_text import format_toml
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2, UNITS
 from tests.builders.rigs import RIG_TEXT
+from tests.input_errors import raises_input_error
 from tests.table_io.config.test_refusals import format_sweep
 
 
@@ -24,9 +24,8 @@ def profile(**changes: Any) -> Profile:
 
 def list_faults(text: str, card: type[ConfigModel] = Profile) -> tuple[InputError, ...]:
     """The faults of a text that is refused as a whole."""
-    with pytest.raises(InputError) as caught:
+    with raises_input_error(where="some/test.toml") as caught:
         parse_toml(text, card, "some/test.toml")
-    assert caught.value.where == "some/test.toml"
     return caught.value.faults
 
 
@@ -72,22 +71,19 @@ def test_invalid_toml_names_the_line() -> None:
 
 
 def test_missing_file_names_its_neighbours(tmp_path: Path) -> None:
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=str(tmp_path / "nowhere" / "g4.toml")):
         load_config(tmp_path / "nowhere" / "g4.toml", Profile, "test")
-    assert error.value.where == str(tmp_path / "nowhere" / "g4.toml")
     (tmp_path / "g5.toml").write_text(format_sweep({}))
-    with pytest.raises(InputError) as error:
+    with raises_input_error(where=str(tmp_path / "g4.toml"), remedy="there: g5.toml"):
         load_config(tmp_path / "g4.toml", Profile, "test")
-    assert (error.value.where, error.value.remedy) == (str(tmp_path / "g4.toml"), "there: g5.toml")
 
 
 def test_unreadable_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "bytes.toml").write_bytes(b"title = '\xff\xfe'")
     for name in ("folder.toml", "bytes.toml"):
-        with pytest.raises(InputError) as error:
+        with raises_input_error(where=str(tmp_path / name)):
             load_config(tmp_path / name, Profile, "test")
-        assert error.value.where == str(tmp_path / name)
 
 
 @pytest.mark.parametrize("channel", sorted(CHANNEL_BY_NAME))

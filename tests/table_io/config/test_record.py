@@ -13,16 +13,10 @@ from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
 from table_io.errors import InputError
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import check_limits, compute_demands
+from tests.builders.profiles import RECORD_TOML
 from tests.builders.rigs import RIG
+from tests.input_errors import raises_input_error
 
-TEST = """title = "a record"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[excitation]
-kind = "record"
-file = "motion.csv"
-"""
 RATE_HZ = 100.0
 DURATION_S = 8.0
 
@@ -46,7 +40,7 @@ def csv(
 
 def write(folder: Path, text: str, more: str = "", file: str = "motion.csv") -> Path:
     (folder / file).write_text(text)
-    (folder / "test.toml").write_text(TEST + more)
+    (folder / "test.toml").write_text(RECORD_TOML + more)
     return folder / "test.toml"
 
 
@@ -121,19 +115,13 @@ def faulty(line: int, text: str) -> str:
     ("text", "more", "key", "words"),
     [
         (faulty(40, "0.37,nan"), "", "excitation.file", ("motion.csv: row 40",)),
-        (faulty(40, "0.37,inf"), "", "excitation.file", ("motion.csv: row 40",)),
-        (faulty(40, "0.37;1.0"), "", "excitation.file", ("motion.csv: row 40 has 1 cells",)),
-        (faulty(40, "0.10,1.0"), "", "excitation.file", ("motion.csv: row 40",)),
         (faulty(40, "0.3745,1.0"), "", "excitation.file", ("motion.csv: row 40", "0.01 s")),
         (faulty(2, "time_s,disp"), "", "excitation.file", ("motion.csv", "'disp'")),
-        (csv(), 'unit = "m"', "excitation.file", ("motion.csv", "'m'", "disp_mm")),
         (csv(), 'unit = "km"', "excitation.unit", ("'km'", "'mm'")),
         (csv(), "scale = 0.0", "excitation.scale", ()),
         (csv(), "blend_s = 0.0", "excitation.blend_s", ("0.1",)),
         (csv(), "windows = 0", "excitation.windows", ()),
         (csv(), "scal = 2.0", "excitation.scal", ("'scale'",)),
-        (csv(rate_hz=1.0), "", "excitation.file", ("motion.csv", "9 samples", "16 to")),
-        ("", "", "excitation.file", ("motion.csv", "empty")),
         (csv(), "[dwell]\ncycles = 3", "dwell", ("'record'",)),
         (csv(), "[control]\ngain = 0.5", "control", ("'record'",)),
         (csv(), '[resume]\nfirst_step = 0\nof = "x"', "resume", ("'record'",)),
@@ -143,9 +131,8 @@ def faulty(line: int, text: str) -> str:
 def test_fault_of_the_profile_or_its_file_is_named(
     text: str, more: str, key: str, words: tuple[str, ...], tmp_path: Path
 ) -> None:
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(where=str(tmp_path / "test.toml")) as refusal:
         load_profile(write(tmp_path, text, more))
-    assert refusal.value.where == str(tmp_path / "test.toml")
     (fault,) = refusal.value.faults
     assert fault.key == key
     assert all(word in str(fault) for word in words), fault
@@ -164,18 +151,14 @@ def test_unknown_kind_is_refused_with_the_known_ones(name: object, tmp_path: Pat
 
 def test_missing_file_is_named(tmp_path: Path) -> None:
     path = write(tmp_path, csv(), file="other.csv")
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(key="excitation.file", value="motion.csv", where=str(path)):
         load_profile(path)
-    assert (refusal.value.key, refusal.value.value) == ("excitation.file", "motion.csv")
-    assert refusal.value.where == str(path)
 
 
 def test_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) -> None:
     path = write(tmp_path, csv() + "#" * MAX_FILE_BYTES)
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(where=str(tmp_path / "motion.csv"), allowed="2 MB"):
         load_profile(path)
-    assert refusal.value.where == str(tmp_path / "motion.csv")
-    assert "2 MB" in refusal.value.allowed
 
 
 @pytest.mark.parametrize(
@@ -193,9 +176,8 @@ def test_file_that_cannot_be_attached_is_refused(
     inline = 'excitation = {kind = "record", file = "motion.csv"}\n'
     if old:
         path.write_text(inline + path.read_text().replace(old, ""))
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(where=str(path), key="excitation"):
         load_profile(path)
-    assert (refusal.value.where, refusal.value.key) == (str(path), "excitation")
 
 
 def test_text_of_a_profile_holds_its_file(tmp_path: Path) -> None:
@@ -211,7 +193,7 @@ def test_text_of_a_profile_holds_its_file(tmp_path: Path) -> None:
 
 def test_text_without_its_file_is_refused() -> None:
     with pytest.raises(InputError) as refusal:
-        parse_toml(TEST, Profile, "some/test.toml")
+        parse_toml(RECORD_TOML, Profile, "some/test.toml")
     assert [fault.key for fault in refusal.value.faults] == ["excitation.file"]
 
 
@@ -238,7 +220,5 @@ def test_drive_file_of_this_program_is_a_record() -> None:
 
 def test_other_parts_ask_for_a_sweep_in_one_message(tmp_path: Path) -> None:
     profile, _ = load_profile(write(tmp_path, csv()))
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(key="excitation.kind", value="record", allowed="stepped_sine"):
         _ = profile.sweep
-    assert (refusal.value.key, refusal.value.value) == ("excitation.kind", "record")
-    assert refusal.value.allowed == "stepped_sine"

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from table_io.config.base import ConfigModel, parse_toml
+from table_io.config.base import ConfigModel, format_toml, parse_toml
 from table_io.config.profile import Profile, load_profile
 from table_io.config.rig import RigConfig
-from table_io.config.toml_text import format_toml
 from tests.builders.rigs import LAB_TEXT, RIG_TEXT, read_rig_text
 from tests.input_errors import raises_input_error
 

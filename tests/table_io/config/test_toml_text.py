@@ -3,7 +3,7 @@
 import math
 import tomllib
 
-from table_io.config.toml_text import format_toml
+from table_io.config.base import format_toml
 
 
 def test_table_is_read_as_it_was_written() -> None:

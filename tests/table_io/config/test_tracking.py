@@ -9,16 +9,9 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import MAX_SPECTRUM_BYTES, Profile, load_profile
 from table_io.config.tracking import TrackingConfig, parse_required_spectrum
 from table_io.units import GRAVITY_M_S2
+from tests.builders.profiles import RECORD_TOML
 from tests.input_errors import raises_input_error
 
-RECORD = """title = "A record"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[excitation]
-kind = "record"
-file = "motion.csv"
-"""
 SWEEP = """title = "A sweep"
 [specimen]
 mass_kg = 550.0
@@ -39,7 +32,7 @@ def write(folder: Path, more: str, spectrum: str | None = SPECTRUM) -> Path:
     if spectrum is not None:
         (folder / "rrs.csv").write_text(spectrum)
     path = folder / "test.toml"
-    path.write_text(RECORD + more)
+    path.write_text(RECORD_TOML + more)
     return path
 
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from table_io.block import Label
-from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment, Segment, peak_acceleration_ratio
 from table_io.excitation.trajectory import (
     SineTarget,
@@ -17,6 +16,7 @@ from table_io.excitation.trajectory import (
     start_trajectory,
 )
 from table_io.records import Step
+from tests.builders.profiles import make_profile
 from tests.table_io.excitation.test_kinds import profile as make_example
 
 RATE_HZ = 1000.0
@@ -168,17 +168,18 @@ def test_drive_ends_with_a_soft_stop_of_its_last_step() -> None:
     assert AT_REST.to_drive(()).segments == ()
 
 
-def make_profile(**changes: object) -> Profile:
-    grid = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 5, "measured_cycles": 2}
-    specimen = {"mass_kg": 550.0, "gap_mm": 4.0}
-    return Profile.model_validate({"title": "t", "specimen": specimen, "sweep": grid} | changes)
+def test_second_decay_does_not_postpone_the_first() -> None:
+    drive = plan_sweep(make_profile())
+    stopped = drive.decay_from(7000)
+    assert stopped.decay_from(7500) == stopped
+    assert stopped.decay_from(6000) == drive.decay_from(6000)
 
 
 @pytest.mark.parametrize("rest_s", [1.0, 1.5003])
 @pytest.mark.parametrize("rate_hz", [1000.0, 2000.0])
 def test_trajectory_starts_after_its_rest(rate_hz: float, rest_s: float) -> None:
     acquisition = {"rate_hz": rate_hz, "rest_s": rest_s}
-    start = start_trajectory(make_profile(acquisition=acquisition))
+    start = start_trajectory(make_profile(tables={"acquisition": acquisition}))
     assert -1e-9 <= start.end - rest_s * rate_hz < 1.0
     assert (start.rate_hz, start.target, start.segments) == (rate_hz, SineTarget(2.0, 0.0), ())
 

@@ -8,8 +8,8 @@ import pytest
 from table_io.block import Float1D
 from table_io.config.excitation import History, find_excitation
 from table_io.config.excitation.waveform import interpolate_level, smoothstep
-from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
+from tests.input_errors import raises_input_error
 
 RATE_HZ = 2000.0
 
@@ -176,7 +176,6 @@ NOISE = {"low_hz": 0.5, "high_hz": 15.0}
 def test_kind_too_fast_for_the_rate_is_refused(
     kind: str, keys: dict[str, Any], rate_hz: float
 ) -> None:
-    with pytest.raises(InputError) as refusal:
+    with raises_input_error(where=f"excitation {kind!r}") as refusal:
         make(kind, **keys).plan(rate_hz)
-    assert refusal.value.where == f"excitation {kind!r}"
     assert refusal.value.allowed

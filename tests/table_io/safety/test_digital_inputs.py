@@ -14,11 +14,11 @@ from table_io.backends.ni.driver import NiDigitalInputs
 from table_io.clock import ManualClock
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
-from table_io.errors import InputError
 from table_io.safety.wiring_check import CheckLine, check_digital_inputs
 from table_io.sim.ni.device import SimulatedDaqDevice
 from table_io.sim.ni.service import NiDeviceService
 from tests.builders.rigs import RIG_TEXT, read_rig_text
+from tests.input_errors import raises_input_error
 
 TEXT = read_rig_text("ni_simulated")
 WATCHED = """
@@ -121,10 +121,9 @@ def test_vendors_client_reads_the_lines_of_the_card(lab: Lab) -> None:
 
 def test_missing_line_is_refused(lab: Lab) -> None:
     wiring, service, _ = lab
-    with pytest.raises(InputError) as error:
+    with raises_input_error(remedy="heartbeat_back and well") as error:
         NiDigitalInputs(wiring.model_copy(update={"well": {"limit": "Dev1/port9/line9"}}))
     assert "Dev1/port9/line9" in error.value.key
-    assert "heartbeat_back and well" in error.value.remedy
     assert service.device.tasks == ()
 
 

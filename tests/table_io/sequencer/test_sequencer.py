@@ -25,6 +25,7 @@ from table_io.sequencer.procedure import (
 from table_io.sequencer.state import SequencerState
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segment_at, sine_segments
+from tests.builders.profiles import make_profile
 from tests.builders.rigs import RIG
 
 RATE_HZ = 2000.0
@@ -34,16 +35,8 @@ CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
 
 def profile(control: dict[str, Any] | None = None, **sweep: Any) -> Profile:
     """2, 3, 4 Hz up and down, four cycles each, no loop check."""
-    grid = {"start_hz": 2.0, "stop_hz": 4.0, "step_hz": 1.0, "cycles": 4, "measured_cycles": 2}
-    return Profile.model_validate(
-        {
-            "title": "short",
-            "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-            "sweep": {**grid, **sweep},
-            "control": control or {},
-            "loop_check": {"enabled": False},
-        }
-    )
+    tables = {"control": control or {}, "loop_check": {"enabled": False}}
+    return make_profile(tables=tables, **{"stop_hz": 4.0, "step_hz": 1.0, **sweep})
 
 
 @dataclass

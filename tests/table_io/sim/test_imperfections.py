@@ -20,6 +20,7 @@ from table_io.sim.imperfections import (
     draw_laboratory,
     resolve_sides,
 )
+from tests.input_errors import raises_input_error
 
 DOC = Path(__file__).resolve().parents[3] / "table_io" / "sim" / "IMPERFECTIONS.md"
 
@@ -168,6 +169,5 @@ def test_only_one_and_only_known_ones_are_drawn() -> None:
     assert set(bits) == {11.0, 12.0, 13.0}
     forms = {draw_laboratory("bad", generator, "anti_alias_filter")[0].form for _ in range(20)}
     assert forms == {form for name, form in IMPERFECTION_BY_ID if name == "anti_alias_filter"}
-    with pytest.raises(InputError) as error:
+    with raises_input_error(key="only", value="hun"):
         draw_laboratory("bad", generator, "hun")
-    assert (error.value.key, error.value.value) == ("only", "hun")

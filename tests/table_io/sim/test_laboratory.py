@@ -27,6 +27,7 @@ from table_io.sim.simulated_table import Digitizer, SimulatedBackend, hide_laws
 from tests.builders.profiles import SPECIMEN
 from tests.builders.rigs import RIG, change_rig
 from tests.builders.truths import seal_truth
+from tests.input_errors import raises_input_error
 
 CHANNELS = RIG.channels
 RATE_HZ = 2000.0
@@ -187,11 +188,9 @@ def test_tiny_imperfection_does_next_to_nothing_and_a_bad_one_something(
 def test_channel_that_the_rig_lacks_or_that_does_not_fit_is_refused() -> None:
     for name, channel in (("hum", "rel_disp_m"), ("highpass", "mass_disp_m")):
         size = {"rms": 1.0} if name == "hum" else {"corner_hz": 1.0}
-        with pytest.raises(InputError) as error:
+        with raises_input_error(key="channel", value=channel, allowed="mass_acc_m_s2") as error:
             laboratory(imperfection(name, channel=channel, **size))
-        assert (error.value.key, error.value.value) == ("channel", channel)
         assert name in error.value.where
-        assert "mass_acc_m_s2" in error.value.allowed
     with pytest.raises(InputError):
         laboratory(imperfection("light_spot", channel="drive_disp_m", rms=1e-6))
 
@@ -341,14 +340,6 @@ def test_low_cut_forgets_a_step() -> None:
     )
     constant = measured(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=np.ones(50))
     np.testing.assert_allclose(constant[ROW["mass_acc_m_s2"]], 0.0, atol=1e-12)
-
-
-def test_low_cut_has_its_corner() -> None:
-    t = np.arange(40000) / RATE_HZ
-    line = np.sin(TURN * 2.0 * t)
-    out = measured(imperfection("highpass", corner_hz=0.5), table_acc_m_s2=line)
-    response = harmonic(out[ROW["table_acc_m_s2"], 20000:], 2.0, RATE_HZ) / -1j
-    assert response == pytest.approx(1.0 / (1.0 - 0.25j), abs=1e-5)
 
 
 def test_bracket_resonates() -> None:
