@@ -365,16 +365,6 @@ def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
     return reaction
 
 
-def read_table_motion(recording: Recording) -> TableRehearsal:
-    """Return command and table of a whole recording, from rest to rest.
-
-    The specimen's force on the table is that of its measured acceleration. Without an accelerometer
-    the acceleration is the second derivative of the displacement. InputError if samples or other
-    channels are missing.
-    """
-    return _read_moving_block(recording)[1]
-
-
 def _read_moving_block(recording: Recording) -> tuple[Block, TableRehearsal]:
     """Return the samples of a recording from rest to rest, and the motion of the table in them."""
     block = _find_whole_block(recording, CHANNELS[:2])
