@@ -17,7 +17,7 @@ from twin.discovery.features.prediction import describe_feature
 from twin.discovery.result import FeatureVerdict
 from twin.guide.gallery import write_gallery
 from twin.guide.loops import compute_loops, find_loops
-from twin.guide.notebook import convert_notebook
+from twin.guide.markdown import convert_notebook
 from twin.guide.paper_gap import RESULT_FILE, write_paper_gap
 from twin.guide.reference import CONFIG_FILES, write_command_reference, write_key_reference
 from twin.laws.effect import Effect

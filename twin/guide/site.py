@@ -13,8 +13,7 @@ from typer.core import TyperGroup
 
 from table_io.errors import InputError
 from twin.guide.gallery import write_gallery
-from twin.guide.markdown import RenderedMarkdown, render_markdown
-from twin.guide.notebook import convert_notebook
+from twin.guide.markdown import RenderedMarkdown, convert_notebook, render_markdown
 from twin.guide.paper_gap import write_paper_gap
 from twin.guide.reference import (
     PACKAGES_DIR,

@@ -129,19 +129,6 @@ def test_example_is_checked_runs_and_is_replayed_without_its_package(lab: Path) 
     assert replay.returncode == 0, replay.stderr
 
 
-def test_without_the_package_every_command_refuses_the_rig_file(lab: Path) -> None:
-    for words in (
-        ("check", "two.toml", "--table", "rig.toml"),
-        ("run", "two.toml", "--table", "rig.toml", "--speed", "max", "--out", "none"),
-        ("table", "--rig", "rig.toml"),
-    ):
-        result = call_main(*words, cwd=lab)
-        text = result.stdout + result.stderr
-        assert result.returncode == 2, text
-        assert text.count("\n") == 1, text
-    assert not (lab / "none").exists()
-
-
 def test_backend_that_is_not_installed_is_named_with_file_and_choice(tmp_path: Path) -> None:
     path = tmp_path / "rig.toml"
     path.write_text(RIG)

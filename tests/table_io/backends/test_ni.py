@@ -20,7 +20,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
-from table_io.records import RunStop, SampleGap, Trip
+from table_io.records import RunStop, SampleGap
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
@@ -77,39 +77,6 @@ def test_session_is_played_without_a_gap() -> None:
     values = np.concatenate([item.values for item in items if isinstance(item, Block)], axis=1)
     assert values.shape[1] == items[-1].index
     assert 2e-3 < np.abs(values[1]).max() < 4e-3  # 0.05 g at 2 Hz: 3.1 mm
-
-
-@pytest.mark.parametrize("call", CALLS)
-def test_session_with_a_driver_error_ends_at_rest(call: Any, tmp_path: Path) -> None:
-    code = {"read": -200279, "write": -200292, "start": -89120, "heartbeat": -200587}.get(call)
-    fault = f'faults = [{{ call = "{call}", code = {code or -200621}, at_s = 2.1 }}]\n'
-    bed = Bed(CARD.replace("inputs = [", fault + "inputs = [", 1), tmp_path / "box")
-    if call == "start":  # it would refuse to open otherwise
-        planted, bed.device.faults = bed.device.faults, []
-        begin = NiBackend.open
-
-        def begin_with_fault(backend: NiBackend) -> None:
-            begin(backend)
-            bed.device.faults = planted
-
-        with pytest.MonkeyPatch.context() as patched:
-            patched.setattr(NiBackend, "open", begin_with_fault)
-            items = session(bed)
-    else:
-        items = session(bed)
-    bed.rest()
-    trip, stop = items[-2], items[-1]
-    assert isinstance(trip, Trip)
-    assert isinstance(stop, RunStop)
-    assert stop.verdict == "halted"
-    assert f"error {code or -200621} (" in stop.reason
-    life = read_flight_record(tmp_path / "box")[-1]
-    if call != "start":
-        assert life.notes[-1][1] == "at rest"
-        assert abs(life.row("command_m")[-1]) < 1e-6
-        assert 4200 <= stop.index < 4200 + 0.7 * RATE_HZ
-        last = [item for item in items if isinstance(item, Block)][-1]
-        assert stop.index == last.end
 
 
 @pytest.mark.parametrize("call", CALLS)

@@ -236,29 +236,6 @@ def press_bumper(share: float, change: Change | None = None) -> Change:
     return press
 
 
-def add_harmonic(values: Any) -> None:
-    """Let the table add half the level at three times the frequency of each step."""
-    labels, _, phase, level, _ = evaluate_drive(PLAN)
-    held = np.isin(labels[1], (Label.SETTLE, Label.MEASURE))
-    omega = 6 * np.pi * np.where(held, np.abs(np.gradient(phase)) * RATE_HZ, np.inf)
-    extra = np.where(held, 0.5 * level * np.sin(6 * np.pi * phase), 0.0)
-    values[[ACC, MASS_ACC]] += extra
-    values[[TABLE, MASS]] -= extra / omega**2
-
-
-def change_blends(values: Any) -> None:
-    blend = PLAN.labels(0, values.shape[1])[1] == Label.BLEND
-    values[np.ix_([TABLE, ACC, MASS, MASS_ACC], blend)] *= 1.13
-
-
-def disturb_command_about_repetition(values: Any) -> None:
-    """Seven samples of a wrong command before a repetition, and five after it."""
-    values[DRIVE, FAULT_SAMPLE : FAULT_SAMPLE + 40] += 5e-3
-    for first in range(FAULT_SAMPLE + 3, FAULT_SAMPLE + 24, 3):
-        values[:, first : first + 3] = values[:, FAULT_SAMPLE : FAULT_SAMPLE + 3]
-    values[DRIVE, FAULT_SAMPLE + 29 :] = simulate_channels()[DRIVE, FAULT_SAMPLE + 29 :]
-
-
 def make_response(lag_s: float) -> FrequencyResponse:
     frequencies_hz = (1.0, 3.0, 9.0)
     phases = tuple(-2 * np.pi * f * lag_s for f in frequencies_hz)
@@ -386,39 +363,7 @@ def test_fault_is_found_in_time(fault: Fault) -> None:
     if fault.value is not None:
         assert finding.value == pytest.approx(fault.value, rel=0.02)
 
-
-@dataclass(frozen=True)
-class Sound:
-    """A change that is no fault: without any finding, or without one of a kind."""
-
-    name: str
-    change: Change | None
-    kind: str = ""
-    options: dict[str, Any] | None = None
-
-
-def list_sound_runs() -> Iterator[Sound]:
-    # fmt: off
-    for scale in (0.0, 0.2, 1.0, 3.0):
-        yield Sound(f"noise times {scale}", None, options={"scale": scale, "lag": 30})
-    for gap_mm in (-10.0, 0.0, float("inf")):
-        yield Sound(f"gap {gap_mm}", None, options={"test": make_test(gap_mm=gap_mm)})
-    yield Sound("spike in two channels", add([R1, R2], 100.0, 1))
-    yield Sound("command a sample late", lambda values: np.copyto(
-        values[DRIVE], 1.005 * np.roll(values[DRIVE], 1)))
-    yield Sound("command wrong about a repetition", disturb_command_about_repetition, "command")
-    yield Sound("lag as identified", None, options={"lag": 30, "known": make_response(0.015)})
-    yield Sound("level in blends", change_blends, "level")
-    yield Sound("harmonic of the table", add_harmonic, "level")
-    for share in (0.5, 0.35, 0.6):
-        yield Sound(f"cells share {share}", press_bumper(share))
     # fmt: on
-
-
-@pytest.mark.parametrize("run", [*list_sound_runs()], ids=lambda run: run.name)
-def test_sound_run_has_no_finding(run: Sound) -> None:
-    findings = list_findings(run.change, **run.options or {})
-    assert [finding for finding in findings if finding.kind == run.kind or not run.kind] == []
 
 
 @pytest.mark.parametrize("noisy", [(ACC,), (TABLE,), (TABLE, ACC), (TABLE, ACC, MASS, MASS_ACC)])
