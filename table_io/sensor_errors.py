@@ -22,6 +22,9 @@ from table_io.compilation import jit_untyped_kernel
 # by 4.2 ms.
 MAX_LOW_CUT_RAD_S = 2 * math.pi * 1.0
 MAX_DELAY_S = 0.005
+# Of gain, gain x low cut, delay.
+LEAST_ERRORS = np.array([-math.inf, 0.0, -MAX_DELAY_S])
+LARGEST_ERRORS = np.array([math.inf, MAX_LOW_CUT_RAD_S, MAX_DELAY_S])
 # Standard deviations expected before anything is measured: gain, gain x low cut, delay. At one
 # frequency low cut and delay are told apart by them only.
 PRIOR_SD = (0.2, 2 * math.pi * 0.3, 0.001)
@@ -98,17 +101,17 @@ def solve_errors(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> Pai
 
 def _solve_bounded(matrix: Float2D, rhs: Float1D, fixed_gain: bool = False) -> PairErrors:
     """Solve normal equations that include the expected values within the bounds."""
-    low = np.array([-math.inf, 0.0, -MAX_DELAY_S])
-    high = np.array([math.inf, MAX_LOW_CUT_RAD_S, MAX_DELAY_S])
     x, is_free = np.array([1.0, 0.0, 0.0]), np.array([not fixed_gain, True, True])
     while is_free.any():
-        x[is_free] = np.linalg.solve(
-            matrix[np.ix_(is_free, is_free)], (rhs - matrix[:, ~is_free] @ x[~is_free])[is_free]
-        )
-        beyond = is_free & ((x < low) | (x > high))
+        if is_free.all():
+            x = np.linalg.solve(matrix, rhs)
+        else:
+            known = matrix[:, ~is_free] @ x[~is_free]
+            x[is_free] = np.linalg.solve(matrix[np.ix_(is_free, is_free)], (rhs - known)[is_free])
+        beyond = is_free & ((x < LEAST_ERRORS) | (x > LARGEST_ERRORS))
         if not beyond.any():
             break
-        x = np.clip(x, low, high)
+        x = np.clip(x, LEAST_ERRORS, LARGEST_ERRORS)
         is_free &= ~beyond
     gain, scaled_low_cut, delay_s = x.tolist()
     # A gain far below 1 is that of no sound sensor.

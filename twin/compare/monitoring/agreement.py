@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from table_io.block import Block, Bool2D, Float1D, Float2D
+from table_io.block import Block, Bool1D, Float1D, Float2D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, relative_displacement
 from table_io.records import Agreement, Event, Record
 from twin.compare import COMPARED_CHANNELS
@@ -56,11 +56,10 @@ def check_agreement(
     The twin is not judged by a cycle in which its input was wrong.
     """
     measured = compared_values(cycle.measured)
-    errors = [
-        (values - cycle.predicted.channel(f"window/{name}")) ** 2
-        for values, name in zip(measured, COMPARED_CHANNELS, strict=True)
-    ]
-    phase_errors = [[_rms(squares[phase]) for squares in errors] for phase in _phases(setup, cycle)]
+    errors = measured - np.array(
+        [cycle.predicted.channel(f"window/{name}") for name in COMPARED_CHANNELS]
+    )
+    squares, phases = errors**2, _phases(setup, cycle)
     half_ranges = [_half_range(values) for values in measured]
     band = [
         _min_band(setup, noise, name)
@@ -69,10 +68,10 @@ def check_agreement(
     ]
     record = Agreement(
         cycle.end, cycle.step.index, cycle.number, len(cycle.measured), COMPARED_CHANNELS,
-        tuple(_rms(squares) for squares in errors), tuple(band),
-        *(tuple(rms) for rms in phase_errors),
+        _rms(squares), tuple(band),
+        *(_rms(np.compress(phase, squares, axis=1)) for phase in phases),
     )  # fmt: skip
-    shares = _judge_errors(setup, cycle, record, measured)
+    shares = _judge_errors(setup, cycle, record, errors, phases)
     if not is_input_right or np.isnan(record.error).all():
         return state, [record]
     if state.cycles == ALREADY_REPORTED:
@@ -89,18 +88,22 @@ def check_agreement(
 
 
 def _judge_errors(
-    setup: MonitoringSetup, cycle: CycleData, record: Agreement, measured: Float2D
+    setup: MonitoringSetup,
+    cycle: CycleData,
+    record: Agreement,
+    errors: Float2D,
+    phases: list[Bool1D],
 ) -> list[float]:
     """Return the error of each compared channel in units of its band, with allowances."""
-    right, left = (float(phase.mean()) for phase in _phases(setup, cycle)[1:])
+    right, left = (float(phase.mean()) for phase in phases[1:])
     travel_m = _half_range(cycle.channel_values("table_disp_m"))
     allowance, forces = set_up_allowances(setup.model.parameters, right, left, travel_m)
     error = dict(zip(COMPARED_CHANNELS, record.error, strict=True))
     band = dict(zip(COMPARED_CHANNELS, record.band, strict=True))
-    rows = dict(zip(COMPARED_CHANNELS, measured, strict=True))
+    rows = dict(zip(COMPARED_CHANNELS, errors, strict=True))
     for cells, force in zip((RIGHT_CELLS, LEFT_CELLS), forces, strict=True):
-        total = sum(rows[name] - cycle.predicted.channel(f"window/{name}") for name in cells)
-        side_error, side_band = _rms(np.asarray(total) ** 2), sum(band[name] for name in cells)
+        total: Float1D = np.sum([rows[name] for name in cells], axis=0)
+        (side_error,), side_band = _rms(total[None] ** 2), sum(band[name] for name in cells)
         for name in cells:
             allowance[name] = 0.5 * force
             if np.isfinite(side_error):
@@ -154,7 +157,7 @@ def _min_band(setup: MonitoringSetup, noise: ChannelNoise, name: str) -> float:
     return NOISE_FACTOR * rms if rms > 0 else float("nan")
 
 
-def _phases(setup: MonitoringSetup, cycle: CycleData) -> list[Bool2D]:
+def _phases(setup: MonitoringSetup, cycle: CycleData) -> list[Bool1D]:
     """Return masks of flight, contact right and contact left: by load cells, else by gaps."""
     right, left = detect_contact(cycle.measured, setup.contact_n, setup.gaps_m)
     return [~(right | left), right, left]
@@ -162,7 +165,7 @@ def _phases(setup: MonitoringSetup, cycle: CycleData) -> list[Bool2D]:
 
 def detect_contact(
     block: Block, contact_n: float, gaps_m: tuple[float, float]
-) -> tuple[Bool2D, Bool2D]:
+) -> tuple[Bool1D, Bool1D]:
     """Return where the mass touches the right and the left bumper, (sample,): by load cells.
 
     By the gaps where a load cell has no value.
@@ -175,10 +178,14 @@ def detect_contact(
     return right, left
 
 
-def _rms(squares: Float1D) -> float:
-    """Return the root of the mean of known squares; NaN if less than half are known."""
-    known = squares[~np.isnan(squares)]
-    return float(np.sqrt(known.mean())) if 2 * known.size > squares.size else float("nan")
+def _rms(squares: Float2D) -> tuple[float, ...]:
+    """Return the root mean of the known squares of each row; NaN if less than half are known."""
+    if squares.size and np.isfinite(squares).all():
+        return tuple(np.sqrt(squares.mean(axis=1)).tolist())
+    known = [row[~np.isnan(row)] for row in squares]
+    return tuple(
+        float(np.sqrt(row.mean())) if 2 * row.size > squares.shape[1] else math.nan for row in known
+    )
 
 
 def _half_range(values: Float1D) -> float:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+import numpy.typing as npt
 
 from table_io.block import Block, Float1D, Float2D, Label
 from table_io.records import Step
@@ -118,7 +119,14 @@ def weight_functions(samples: int, rate_hz: float) -> tuple[Float2D, Float2D, Fl
     return phi, slope, curvature
 
 
-def weighted_sums(functions: Float2D, values: Float1D) -> Float1D:
-    """Return the sum of the values times each test function, (function,)."""
-    total: Float1D = (functions * values).sum(axis=1)
+@lru_cache(maxsize=64)
+def weight_norms(samples: int, rate_hz: float) -> tuple[Float1D, Float1D]:
+    """Return the root sums of squares of phi and phi'', (function,) each."""
+    phi, _, curvature = weight_functions(samples, rate_hz)
+    return np.sqrt((phi**2).sum(axis=1)), np.sqrt((curvature**2).sum(axis=1))
+
+
+def weighted_sums(functions: Float2D, values: npt.ArrayLike) -> Float2D:
+    """Return the sum of values (..., sample) times each test function, (..., function)."""
+    total: Float2D = (functions * np.asarray(values)[..., None, :]).sum(axis=-1)
     return total

@@ -10,6 +10,8 @@ whose slopes differ by e add e y to u, with the table's displacement y; a low cu
 the accelerometer that are left add -w x' - t a' to a, with the displacement x of the mass.
 """
 
+from functools import lru_cache
+
 import numpy as np
 
 from table_io.block import Float1D, Float2D
@@ -19,6 +21,7 @@ from twin.compare.monitoring.cycle import (
     CycleData,
     MonitoringSetup,
     weight_functions,
+    weight_norms,
     weighted_sums,
 )
 from twin.compare.monitoring.low_cut import body_displacement
@@ -60,18 +63,19 @@ def _damper_equations(
     if is_flight.mean() < MIN_FLIGHT_SHARE:  # the error of the load cells hides the damper
         return None
     phi, slope, _ = weight_functions(u.size, setup.rate_hz)
-    values = -weighted_sums(phi, p.mass * a + _effect_forces(setup, cycle, "damper"))
-    by_force = [weighted_sums(phi, side_force) for side_force in sides]
-    by_plates = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_acc_m_s2")))
-    by_table = weighted_sums(phi, np.nan_to_num(cycle.channel_values("table_disp_m")))
     x = body_displacement(cycle.corrected, "mass_acc_m_s2")
-    by_low_cut = p.mass * weighted_sums(slope, u if x is None else np.nan_to_num(x))
-    by_lag = p.mass * weighted_sums(slope, a)
-    by_motion = [weighted_sums(phi, u), -weighted_sums(slope, u)]
-    rows = np.stack([*by_motion, *by_force, by_plates, by_table, by_low_cut, by_lag], axis=1)
+    table = [cycle.channel_values(name) for name in ("table_acc_m_s2", "table_disp_m")]
+    inertia = p.mass * a + _effect_forces(setup, cycle, "damper")
+    by_inertia, by_disp, *others = weighted_sums(phi, [inertia, u, *sides, *np.nan_to_num(table)])
+    by_speed, by_low_cut, by_lag = weighted_sums(
+        slope, [u, u if x is None else np.nan_to_num(x), a]
+    )
+    values = -by_inertia
+    nuisances = p.mass * by_low_cut, p.mass * by_lag
+    rows = np.stack([by_disp, -by_speed, *others, *nuisances], axis=1)
     acc_rms = _finite_or(noise.channel_rms("mass_acc_m_s2"), 1e-3 * float(a.std())) * p.mass
     cell_rms = _finite_or(noise.channel_rms(RIGHT_CELLS[0]), 0.0)
-    white_sd = np.sqrt((phi**2).sum(axis=1)) * np.hypot(acc_rms, 2 * cell_rms)
+    white_sd = weight_norms(u.size, setup.rate_hz)[0] * np.hypot(acc_rms, 2 * cell_rms)
     sd = np.hypot(
         white_sd, LOAD_CELL_ERROR * weighted_sums(np.abs(phi), np.abs(sides[0]) + np.abs(sides[1]))
     )
@@ -128,15 +132,19 @@ def _contact_equations(
     depth: Float1D, push: Float1D, table: Float1D, damping: float, rate_hz: float, rms: float
 ) -> tuple[Float2D, Float1D]:
     """Return noise-scaled equations of one contact."""
-    phi, slope, _ = (functions[:2] for functions in weight_functions(depth.size, rate_hz))
-    values = weighted_sums(phi, push) + damping * weighted_sums(slope, depth)
-    rows = np.stack(
-        [weighted_sums(phi, depth), -phi.sum(axis=1), weighted_sums(phi, table)], axis=1
-    )
-    sd = np.hypot(
-        np.sqrt((phi**2).sum(axis=1)) * rms, LOAD_CELL_ERROR * weighted_sums(np.abs(phi), push)
-    )
+    phi, slope, size, total, norm = _contact_functions(depth.size, rate_hz)
+    by_push, by_depth, by_table = weighted_sums(phi, [push, depth, table])
+    values = by_push + damping * weighted_sums(slope, depth)
+    rows = np.stack([by_depth, -total, by_table], axis=1)
+    sd = np.hypot(norm * rms, LOAD_CELL_ERROR * weighted_sums(size, push))
     return rows / sd[:, None], values / sd
+
+
+@lru_cache(maxsize=512)
+def _contact_functions(samples: int, rate_hz: float) -> tuple[Float2D, ...]:
+    """Return phi, phi', |phi|, the sum of phi and its norm, of the two functions of a contact."""
+    phi, slope, _ = (each[:2] for each in weight_functions.__wrapped__(samples, rate_hz))
+    return phi, slope, np.abs(phi), phi.sum(axis=1), np.sqrt((phi**2).sum(axis=1))
 
 
 def _effect_forces(setup: MonitoringSetup, cycle: CycleData, law: str) -> Float1D:

@@ -212,9 +212,7 @@ def _report_drift(
         p.bumper_stiffness_r * max_depth_m,
         p.bumper_stiffness_l * max_depth_m,
     )
-    names: list[str] = []
-    columns: list[tuple[float, float, float, float]] = []
-    changes: list[tuple[float, float, float]] = []
+    estimates: dict[str, tuple[float, float, float, float]] = {}
     laser_error_m = max(LASER_ERROR_SD_M, LASER_LINEARITY * state.max_travel_m)
     instruments = (
         LASER_SLOPE_SD * p.stiffness,
@@ -231,37 +229,36 @@ def _report_drift(
         (LASER_SLOPE_SD * p.bumper_stiffness_r,),
         (LASER_SLOPE_SD * p.bumper_stiffness_l,),
     )
-    for law, (law_names, law_chunks) in enumerate(zip(PARAMETER_NAMES, state.chunks, strict=True)):
-        full_chunks = [chunk for chunk in law_chunks if chunk.count >= MIN_CHUNK_CYCLES]
-        curvature = law_curvature * force_scale[law]
-        estimates = _law_estimates(full_chunks, law, curvature)
-        names += law_names if estimates else ()
-        columns += estimates
-        if estimates:
-            law_changes = [(float("nan"),) * 3] * 2
-            max_curvature = max(curvature, instruments[law])
-            law_changes[TREND_COLUMNS[law]] = _measure_drift(
-                full_chunks, law, max_curvature, nuisance_sds[law], offset_sds[law]
-            )
-            changes += law_changes
-    if not names:
+    full_chunks = [[c for c in each if c.count >= MIN_CHUNK_CYCLES] for each in state.chunks]
+    curvatures = [law_curvature * scale for scale in force_scale]
+    for law, law_names in enumerate(PARAMETER_NAMES):
+        law_estimates = _law_estimates(full_chunks[law], law, curvatures[law])
+        estimates |= dict(zip(law_names, law_estimates, strict=False))
+    if not estimates:
         return state, []
-    values, sd, drift, drift_sd = (tuple(column) for column in zip(*columns, strict=True))
-    record = Estimate(cycle.end, cycle.step.index, tuple(names), values, sd, drift, drift_sd)
-    items: list[Record] = [record]
+    columns = (tuple(column) for column in zip(*estimates.values(), strict=True))
+    items: list[Record] = [Estimate(cycle.end, cycle.step.index, tuple(estimates), *columns)]
     drifting = set(state.drifting)
-    for name, value, estimate, judged in zip(names, values, columns, changes, strict=True):
+    for law, law_names in enumerate(PARAMETER_NAMES):
+        name = law_names[TREND_COLUMNS[law]]  # the one that may drift
+        if name not in estimates:
+            continue
+        value, _, change, spread = estimates[name]
         min_change = MIN_STIFFNESS_DRIFT * abs(value)
         if name.startswith("gap"):
             min_change = max(MIN_GAP_DRIFT * state.max_depth_m, LEAST_GAP_DRIFT_M)
-        is_significant = all(
-            abs(change) > sigmas * spread and abs(change) > min_change
-            for change, spread, sigmas in ((*estimate[2:], MIN_DRIFT_SIGMA), judged)
-        )
-        if is_significant and name not in drifting:
-            items.append(Event(cycle.end, "drift", _sentence(name, value, *judged[:2])))
+        has_drifted = abs(change) > max(MIN_DRIFT_SIGMA * spread, min_change)
+        if not has_drifted and name not in drifting:
+            continue
+        change, spread, sigmas = _measure_drift(
+            full_chunks[law], law, max(curvatures[law], instruments[law]), nuisance_sds[law],
+            offset_sds[law],
+        )  # fmt: skip
+        if has_drifted and abs(change) > max(sigmas * spread, min_change):
+            if name not in drifting:
+                items.append(Event(cycle.end, "drift", _sentence(name, value, change, spread)))
             drifting.add(name)
-        elif abs(judged[0]) < 0.5 * judged[2] * judged[1]:
+        elif abs(change) < 0.5 * sigmas * spread:
             drifting.discard(name)
     return replace(state, drifting=frozenset(drifting)), items
 

@@ -18,6 +18,7 @@ from twin.compare.monitoring.cycle import (
     CycleData,
     MonitoringSetup,
     weight_functions,
+    weight_norms,
     weighted_sums,
 )
 
@@ -68,7 +69,7 @@ class ConsistencyState:
         """
         return {
             acc: estimate.errors.low_cut
-            if estimate.errors.low_cut > max(MIN_LOW_CUT_RAD_S, estimate.low_cut_sd)
+            if MIN_LOW_CUT_RAD_S < estimate.errors.low_cut > estimate.low_cut_sd
             else 0.0
             for (_, acc, _), estimate in zip(BODY_SENSORS, self.estimates, strict=True)
         }
@@ -127,21 +128,18 @@ def _check_body(
     rms = noise.channel_rms(acc), noise.channel_rms(disp)
     if not (np.isfinite(a + x).all() and np.isfinite(rms).all()):
         return None, estimate
-    phi, slope, curvature = weight_functions(a.size, setup.rate_hz)
     # The first test function shows a steady offset, which is no motion.
-    by_acc, by_disp = weighted_sums(phi, a)[1:], weighted_sums(curvature, x)[1:]
-    sd = np.hypot(
-        rms[0] * np.sqrt((phi[1:] ** 2).sum(axis=1)),
-        rms[1] * np.sqrt((curvature[1:] ** 2).sum(axis=1)),
-    )
+    phi, slope, curvature = (each[1:] for each in weight_functions(a.size, setup.rate_hz))
+    phi_norm, curvature_norm = (each[1:] for each in weight_norms(a.size, setup.rate_hz))
+    by_acc, by_disp = weighted_sums(phi, a), weighted_sums(curvature, x)
+    by_low_cut, by_delay = weighted_sums(slope, [x, a])
+    sd = np.hypot(rms[0] * phi_norm, rms[1] * curvature_norm)
     size = float(np.sqrt((by_acc**2).sum()))
     if size == 0:
         return "", estimate
     low_cut = estimate.errors.low_cut
-    by_low_cut = weighted_sums(slope, x)[1:]
     if low_cut:
-        by_low_cut += low_cut * weighted_sums(phi, _highpass_cycle(x, low_cut, setup.rate_hz))[1:]
-    by_delay = weighted_sums(slope, a)[1:]
+        by_low_cut += low_cut * weighted_sums(phi, _highpass_cycle(x, low_cut, setup.rate_hz))
     profile_share = MAX_LASER_PROFILE_M / max(0.5 * float(np.ptp(x)), MAX_LASER_PROFILE_M)
     weight = 1.0 / np.hypot((FIT_ERROR_RATIO + profile_share) * size, sd)
     rows = weight * np.array([by_disp, by_low_cut, by_delay])
@@ -155,7 +153,7 @@ def _check_body(
     if share <= MAX_ACC_MISMATCH:
         return "", estimate
     # cosine and sine of each harmonic together: independent of the phase
-    profile = MAX_LASER_PROFILE_M * np.sqrt(0.5 * a.size) * np.linalg.norm(curvature[1::2], axis=1)
+    profile = MAX_LASER_PROFILE_M * np.sqrt(0.5 * a.size) * np.linalg.norm(curvature[::2], axis=1)
     allowed = (MAX_ACC_MISMATCH + MAX_LASER_SLOPE_ERROR) * size + profile
     allowed = np.maximum(allowed, NOISE_FACTOR * np.hypot(sd[::2], sd[1::2]))
     if not (np.hypot(mismatch[::2], mismatch[1::2]) > allowed).any():
