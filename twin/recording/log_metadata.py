@@ -8,6 +8,7 @@ import json
 import math
 import tomllib
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.block import Block
@@ -28,11 +29,20 @@ class ContentHash:
         self._hash = hashlib.sha256()
         self._counts: Counter[str] = Counter()
 
-    def add(self, topic: str, log_time: int, payload: bytes) -> int:
-        """Add one message, `log_time` in ns; return how many its topic has."""
-        self._hash.update(b"%s %d %d\n%s" % (topic.encode(), log_time, len(payload), payload))
-        self._counts[topic] += 1
-        return self._counts[topic]
+    def add(self, topic: str, log_time: int, payload: bytes) -> None:
+        """Add one message; `log_time` in ns."""
+        self.add_all(topic, [log_time], [payload])
+
+    def add_all(self, topic: str, log_times: Sequence[int], payloads: Sequence[bytes]) -> int:
+        """Add messages of one topic; return how many of it came before."""
+        name, before = topic.encode(), self._counts[topic]
+        lines = [
+            b"%s %d %d\n%s" % (name, log_time, len(payload), payload)
+            for log_time, payload in zip(log_times, payloads, strict=True)
+        ]
+        self._hash.update(b"".join(lines))
+        self._counts[topic] += len(lines)
+        return before
 
     def to_metadata(self) -> dict[str, str]:
         """Return the values of the metadata record "content"."""

@@ -7,23 +7,18 @@ the first message, so that an interrupted recording is self-contained.
 import contextlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from itertools import chain, count
 from pathlib import Path
 from typing import BinaryIO
 
-from mcap.exceptions import McapError
-from mcap.reader import NonSeekingReader, make_reader
-from mcap.records import Chunk, DataEnd
-from mcap.records import Message as MessageRecord
-from mcap.records import Metadata as MetadataRecord
-from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
 from table_io.block import Block
 from table_io.clock import wall_clock_ns
 from table_io.errors import InputError
 from table_io.records import RunStart
+from twin.recording import recovery
 from twin.recording.log_metadata import (
     SCHEMA_VERSION,
     ContentHash,
@@ -226,16 +221,25 @@ class LogWriter:
 
         Raises LogTimeError, and writes nothing, if the log time exceeds the range of the format.
         """
-        log_time = round(index * 1e9 / self._rate_hz)
-        if log_time > MAX_LOG_TIME_NS:
-            raise LogTimeError(f"sample {index}: its time exceeds the range of a log")
+        self.write_all(topic, [payload], [index], publish_time)
+
+    def write_all(
+        self,
+        topic: str,
+        payloads: Sequence[bytes],
+        indices: Sequence[int],
+        publish_time: int | None = None,
+    ) -> None:
+        """Append the payloads of items of one topic, as `write` does one."""
+        times = [round(index * 1e9 / self._rate_hz) for index in indices]
+        if times and max(times) > MAX_LOG_TIME_NS:
+            raise LogTimeError(f"sample {max(indices)}: its time exceeds the range of a log")
         if topic not in self._channels:
             schema = message_schema(TOPIC_TYPES[topic])
             self._channels[topic] = self._writer.add_channel(topic, *schema)
-        sequence = self._content.add(topic, log_time, payload) - 1
+        first = self._content.add_all(topic, times, payloads)
         time_ns = wall_clock_ns() if publish_time is None else publish_time
-        channel = self._channels[topic]
-        self._writer.add_message(channel, sequence % 2**32, log_time, time_ns, payload)
+        self._writer.add_messages(self._channels[topic], first, times, time_ns, payloads)
         if self._file.pending_bytes > MAX_PENDING_BYTES:
             self._file.drain()
 
@@ -286,51 +290,60 @@ class LogWriter:
 
 def iter_messages(path: Path) -> Iterator[LogMessage]:
     """Yield the messages in file order, one chunk in memory; a damaged file is read as a whole."""
-    count = 0
-    with path.open("rb") as stream:
-        reader = NonSeekingReader(stream, validate_crcs=True)
-        try:
-            for _, channel, message in reader.iter_messages(log_time_order=False):
-                count += 1
-                yield LogMessage(
-                    channel.topic,
-                    message.log_time,
-                    message.data,
-                    message.sequence,
-                    message.publish_time,
-                )
-            return
-        except OSError:
-            raise
-        except Exception:
-            pass  # on damage, the parser and its decompressor raise any exception
-    yield from recover_log(path).messages[count:]  # also messages after the damage
+    count, topics = 0, dict[int, str]()
+    try:
+        for opcode, content in _iter_file_records(path):
+            if opcode == recovery.CHUNK:
+                data = recovery.decompress_chunk(content)
+            else:
+                data = recovery.RECORD_HEADER.pack(opcode, len(content)) + content
+            for kind, begin, end in recovery.iter_records(data):
+                if kind == recovery.MESSAGE:
+                    channel, sequence, *times = recovery.MESSAGE_HEADER.unpack_from(data, begin)
+                    payload = data[begin + recovery.MESSAGE_HEADER.size : end]
+                    yield LogMessage(topics[channel], times[0], payload, sequence, times[1])
+                    count += 1
+                elif kind == recovery.CHANNEL:
+                    number = int.from_bytes(data[begin : begin + 2], "little")
+                    topics.setdefault(number, recovery.parse_string(data[begin:end], 4)[0])
+    except (recovery.InvalidRecordError, KeyError):  # damaged, or its channel is lost
+        yield from recover_log(path).messages[count:]  # also messages after the damage
 
 
-def read_metadata(path: Path) -> Metadata:
-    """Return the metadata records of a finished log by name; empty if it is cut off or damaged."""
-    with path.open("rb") as stream:
-        try:
-            return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
-        except (McapError, ValueError, EOFError):
-            return {}
+def _iter_file_records(path: Path) -> Iterator[tuple[int, bytes]]:
+    """Yield (opcode, content) to the end of the data; raise InvalidRecordError at damage."""
+    with path.open("rb") as file:
+        if file.read(len(recovery.MAGIC)) != recovery.MAGIC:
+            raise recovery.InvalidRecordError("not the beginning of an MCAP file")
+        size = path.stat().st_size
+        while len(header := file.read(recovery.RECORD_HEADER.size)) == recovery.RECORD_HEADER.size:
+            opcode, length = recovery.RECORD_HEADER.unpack(header)
+            if opcode == recovery.DATA_END:
+                break
+            content = file.read(min(length, size))
+            if len(content) < max(length, recovery.MIN_RECORD_LENGTHS.get(opcode, 0)):
+                raise recovery.InvalidRecordError("cut off within a record")
+            yield opcode, content
+
+
+def read_metadata(path: Path, ends: Container[int] = ()) -> Metadata:
+    """Return the metadata records by name, up to damage or a record of the kinds `ends`."""
+    metadata: Metadata = {}
+    with contextlib.suppress(
+        recovery.InvalidRecordError
+    ):  # reading the messages reports the damage
+        for opcode, content in _iter_file_records(path):
+            if opcode in ends:
+                break
+            if opcode == recovery.METADATA:
+                name, end = recovery.parse_string(content, 0)
+                metadata.setdefault(name, recovery.parse_string_map(content, end))
+    return metadata
 
 
 def read_leading_metadata(path: Path) -> Metadata:
     """Return the metadata records before the first message by name, also of an unfinished log."""
-    metadata_by_name: Metadata = {}
-    with path.open("rb") as stream:
-        try:
-            for record in StreamReader(stream, emit_chunks=True).records:
-                if isinstance(record, (Chunk, MessageRecord, DataEnd)):
-                    break
-                if isinstance(record, MetadataRecord):
-                    metadata_by_name.setdefault(record.name, record.metadata)
-        except OSError:
-            raise
-        except Exception:
-            pass  # as in `iter_messages`; reading the messages reports the damage
-    return metadata_by_name
+    return read_metadata(path, (recovery.CHUNK, recovery.MESSAGE))
 
 
 @contextlib.contextmanager

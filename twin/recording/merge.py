@@ -14,7 +14,7 @@ from table_io.records import RunStart
 from twin.recording.log_metadata import START_COPY_NAME, ContentHash, read_schema_version
 from twin.recording.mcap_log import LogWriter, iter_messages, read_leading_metadata, read_metadata
 from twin.recording.reader import START_TOPIC, TOPIC_ORDER
-from twin.recording.recovery import UNFINISHED_REASON, LogMessage, recover_log
+from twin.recording.recovery import UNFINISHED_REASON, LogMessage, ends_whole, recover_log
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.system.files import lock_file
 from twin.system.terminal import print_line
@@ -56,7 +56,7 @@ def verify_log(path: Path) -> bool:
     try:
         for message in iter_messages(path):
             content.add(message.topic, message.log_time, message.payload)
-        return read_metadata(path).get("content") == content.to_metadata()
+        return ends_whole(path) and read_metadata(path).get("content") == content.to_metadata()
     except InputError:
         return False  # not a log
 

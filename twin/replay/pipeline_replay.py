@@ -42,7 +42,15 @@ from twin.results.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import ItemHandler, record_items
 from twin.system.versions import read_installed_versions
-from twin.transport.codec import RECORD_TOPICS, TOPIC_TYPES, Item, WireError, decode_item, strip_run
+from twin.transport.codec import (
+    RECORD_TOPICS,
+    TOPIC_TYPES,
+    Item,
+    WireError,
+    decode_item,
+    encode_run,
+    strip_run,
+)
 from twin.transport.endpoint import CMP_TOPIC, HASH_TOPIC, PRED_TOPIC
 
 
@@ -262,7 +270,7 @@ def replay_recording(
     result.hashes = sum(map(span.includes, _list_expected_hashes(recorded)))
 
     unrecorded: list[int] = []
-    compare = partial(_compare_item, result, recorded, run, unrecorded)
+    compare = partial(_compare_items, result, recorded, run, unrecorded)
     items = replay_items(recording, config, run, span, block_samples)
     record_items(items, path, run, recording.start.rate_hz, on_item, compare)
     result.missing = result.recorded - result.compared
@@ -309,42 +317,65 @@ def _count_lost_with_twin(recorded: RecordedRun, unrecorded: Sequence[int]) -> i
     return count
 
 
-def _compare_item(
+def _compare_items(
     result: ReplayComparison,
     recorded: RecordedRun,
     run: str,
     unrecorded: list[int],
-    new: Item,
-    payload: bytes,
+    items: Sequence[Item],
+    payloads: Sequence[bytes],
 ) -> None:
-    """Update `result` with an item of the replay and its payload, if the recording has the same."""
-    if isinstance(new, PredictionHash) and new.index in recorded.hashes:
-        result.hashes_compared += 1
-        if new != recorded.hashes[new.index]:
-            result.hashes_differing += 1
+    """Update `result` with items of the replay, of one kind, that the recording has too."""
+    if isinstance(items[0], Comparison):
+        result.made += len(items)
+        _compare_comparisons(result, recorded, run, unrecorded, items, payloads)
+        return
+    for new, payload in zip(items, payloads, strict=True):
+        if isinstance(new, PredictionHash) and new.index in recorded.hashes:
+            result.hashes_compared += 1
+            if new != recorded.hashes[new.index]:
+                result.hashes_differing += 1
+                result.note_difference(new.index)
+        elif isinstance(new, Block) and new.stream == "pred" and recorded.predictions:
+            old = recorded.predictions.get(new.index, b"")
+            old = strip_run(old, Block, recorded.recording.run)
+            if old and old == strip_run(payload, Block, run):
+                result.predictions_compared += 1
+                continue
+            for part in select_recorded(new, recorded.start):
+                _compare_predictions(result, recorded, part)
+
+
+def _compare_comparisons(
+    result: ReplayComparison,
+    recorded: RecordedRun,
+    run: str,
+    unrecorded: list[int],
+    items: Sequence[Item],
+    payloads: Sequence[bytes],
+) -> None:
+    """Update `result` with the payloads of comparisons, and `unrecorded` with their samples."""
+    field, old_field = (encode_run(Comparison, each) for each in (run, recorded.recording.run))
+    for new, payload in zip(items, payloads, strict=True):
+        old = recorded.comparisons.get(new.index)
+        if old is None:
+            if recorded.recording.stop is not None:  # else the last comparisons may be missing
+                unrecorded.append(new.index)
+            continue
+        result.compared += 1
+        if old.removesuffix(old_field) != payload.removesuffix(field):
+            result.differing += 1
             result.note_difference(new.index)
-    elif isinstance(new, Block) and new.stream == "pred" and recorded.predictions:
-        for part in select_recorded(new, recorded.start):
-            _compare_predictions(result, recorded, part)
-    if not isinstance(new, Comparison):
+            _measure_difference(result, old, payload)
+
+
+def _measure_difference(result: ReplayComparison, old_payload: bytes, payload: bytes) -> None:
+    """Update `result.largest` with two comparisons that differ; a damaged one tells nothing."""
+    old, new = _decode_comparison(old_payload), _decode_comparison(payload)
+    if old is None or new is None or old.channels != new.channels:
         return
-    result.made += 1
-    old = recorded.comparisons.get(new.index)
-    if old is None:
-        if recorded.recording.stop is not None:  # else the last comparisons may be missing
-            unrecorded.append(new.index)
-        return
-    result.compared += 1
-    if strip_run(old, Comparison, recorded.recording.run) == strip_run(payload, Comparison, run):
-        return
-    result.differing += 1
-    result.note_difference(new.index)
-    old_comparison = _decode_comparison(old)
-    if old_comparison is None or old_comparison.channels != new.channels:
-        return  # damaged: the difference is unknown
-    for name, old_sum, new_sum in zip(
-        new.channels, old_comparison.window_error_ss, new.window_error_ss, strict=False
-    ):
+    sums = zip(new.channels, old.window_error_ss, new.window_error_ss, strict=False)
+    for name, old_sum, new_sum in sums:
         if math.isfinite(old_sum) and math.isfinite(new_sum):
             result.largest[name] = max(result.largest.get(name, 0.0), abs(old_sum - new_sum))
 
@@ -384,6 +415,7 @@ def replay_items(
     """
     first = recording.start.index
     is_whole = span.first == first and not recording.earlier_run
+    has_every = span == SampleRange.all_samples(recording)
     every = 0 if recording.start.source == "model" or not is_whole else config.predictions_every
     yield from iter_start_records(recording, run, config.model_toml, span.first, every)
     for item in rerun_twin(recording, config, block_samples, (span.first, span.last)):
@@ -391,7 +423,7 @@ def replay_items(
             break
         if isinstance(item, Params) and (item.reason != "start" or item.index == first):
             yield replace(item, index=max(item.index, span.first))
-        elif span.includes(item):
+        elif (has_every and isinstance(item, Comparison)) or span.includes(item):
             yield item
     stop = recording.stop
     if stop is not None and stop.index > span.last:

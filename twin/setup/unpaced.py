@@ -1,7 +1,7 @@
 """Runs in one process, without real time: `--speed max` and `simulate`."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,9 +31,10 @@ from twin.setup.realtime import check_full_speed
 from twin.setup.run_config import RunConfig
 from twin.setup.swept_prediction import generate_swept_twin
 from twin.transport.codec import Item, encode_comparisons, encode_item, topic_for
+from twin.transport.endpoint import CMP_TOPIC
 
 ItemHandler = Callable[[Item], None]
-PayloadHandler = Callable[[Item, bytes], None]
+PayloadHandler = Callable[[Sequence[Item], Sequence[bytes]], None]
 FLUSH_INTERVAL_S = 5.0  # of recorded time
 SIMULATED_BLOCK_SAMPLES = 500
 
@@ -62,24 +63,24 @@ def record_items(
     run: str,
     rate_hz: float,
     on_item: ItemHandler,
-    on_payload: PayloadHandler = lambda *_: None,
+    on_payloads: PayloadHandler = lambda *_: None,
 ) -> None:
     """Write every item to a new log at `path`; the log is closed on errors too.
 
-    `on_payload` is called with each recorded item and its payload before writing, `on_item` with
-    each item after.
+    `on_payloads` is called with recorded items of one kind and their payloads before writing,
+    `on_item` with each item after. Comparisons that follow each other are written at once.
     """
     writer = LogWriter(path, rate_hz)
     flushed_index = 0
-    compared: list[Comparison] = []  # since the last item of another kind, encoded at once
-
-    def write(part: Item, payload: bytes) -> None:
-        on_payload(part, payload)
-        writer.write(topic_for(part), payload, part.index)
+    compared: list[Comparison] = []
 
     def write_compared() -> None:
-        for item, payload in zip(compared, encode_comparisons(compared, run), strict=True):
-            write(item, payload)
+        if not compared:
+            return
+        payloads = encode_comparisons(compared, run)
+        on_payloads(compared, payloads)
+        writer.write_all(CMP_TOPIC, payloads, [item.index for item in compared])
+        for item in compared:
             on_item(item)
         compared.clear()
 
@@ -92,7 +93,9 @@ def record_items(
             if isinstance(item, RunStart):
                 writer.write_run_description(item)
             for part in writer.select_recorded(item):
-                write(part, encode_item(part, run))
+                payload = encode_item(part, run)
+                on_payloads([part], [payload])
+                writer.write(topic_for(part), payload, part.index)
             if item.index - flushed_index > FLUSH_INTERVAL_S * rate_hz:
                 writer.flush()
                 flushed_index = item.index

@@ -127,7 +127,7 @@ def encode_comparisons(comparisons: Sequence[Comparison], run: str) -> list[byte
         sums = [(each.measured_ss, each.free_error_ss, each.window_error_ss) for each in group]
         columns = np.array(sums, "<f8")  # (comparison, 3, channel)
         rows = np.tile(np.frombuffer(body, np.uint8), (len(group), 1))
-        end, size = len(body) - len(_run_suffix(Comparison, run)), 8 * columns.shape[2]
+        end, size = len(body) - len(encode_run(Comparison, run)), 8 * columns.shape[2]
         header = len(pb.Comparison(measured_ss=group[0].measured_ss).SerializeToString()) - size
         for column in (2, 1, 0):
             rows[:, end - size : end] = np.ascontiguousarray(columns[:, column]).view(np.uint8)
@@ -140,15 +140,17 @@ def encode_comparisons(comparisons: Sequence[Comparison], run: str) -> list[byte
 
 
 def strip_run(payload: bytes, kind: type, run: str) -> bytes:
-    """Return the payload of a record without its run id, for comparing runs.
+    """Return the payload of an item without its run id, for comparing runs.
 
-    Of a kind whose last field is the run, as of a `Comparison`; others stay as they are.
+    Of a kind whose first or last field is the run, as of a block; others stay as they are.
     """
-    return payload.removesuffix(_run_suffix(kind, run))
+    field = encode_run(kind, run)
+    return payload.removeprefix(field) if kind is Block else payload.removesuffix(field)
 
 
 @cache
-def _run_suffix(kind: type, run: str) -> bytes:
+def encode_run(kind: type, run: str) -> bytes:
+    """Return the field with the run id in the payloads of a kind; the last one but of blocks."""
     return bytes(getattr(pb, MESSAGE_NAMES[kind])(run=run).SerializeToString())
 
 
