@@ -11,6 +11,7 @@ RATE_HZ, DURATION_S, REST_S = 1000.0, 60.0, 4.0
 TIME_S: Float1D = np.arange(int(RATE_HZ * DURATION_S)) / RATE_HZ
 MOVING = TIME_S >= REST_S
 IN_STEP = (TIME_S >= 30.0) & (TIME_S < 38.0)
+UNKNOWN_HZ = np.full(TIME_S.size, np.nan)
 INSIDE = (TIME_S > 2.0) & (TIME_S < DURATION_S - 2.0)
 
 
@@ -26,11 +27,13 @@ def make_harmonic() -> Float1D:
     return np.where(IN_STEP, 5.0 * np.sin(2 * np.pi * 60.0 * TIME_S), 0.0)
 
 
-def clean(*records: Float1D, has_rest: bool = True) -> list[Float1D]:
+def clean(
+    *records: Float1D, has_rest: bool = True, drive_hz: Float1D = UNKNOWN_HZ
+) -> list[Float1D]:
     """Return the records, (sample,) at half the rate, without hum."""
     grid = FrequencyGrid(TIME_S.size, RATE_HZ)
     spectra = {str(k): grid.to_spectrum(values) for k, values in enumerate(records)}
-    cleaned = remove_hum(spectra, grid, ~MOVING & has_rest)
+    cleaned = remove_hum(spectra, grid, ~MOVING & has_rest, drive_hz)
     return [grid.to_time_domain(spectrum) for spectrum in cleaned.values()]
 
 
@@ -77,10 +80,20 @@ def test_hum_is_interpolated_over_a_step_with_a_harmonic_at_its_frequency(
     assert rms_of(departure, IN_STEP) < 0.5 * rms_of(hum[::2], INSIDE)
 
 
+def test_a_harmonic_that_is_weaker_than_the_hum_stays_too(motion: Float1D) -> None:
+    """Its amplitude says nothing: that the drive has a harmonic there does."""
+    harmonic, hum = 0.2 * make_harmonic(), make_hum(60.0, 1.0)
+    expected = clean(motion)[0] + clean(harmonic)[0]
+    drive_hz = np.where(IN_STEP, 4.0, np.nan)
+    departure = clean(motion + harmonic + hum, drive_hz=drive_hz)[0] - expected
+    assert rms_of(departure, IN_STEP) < 0.2 * rms_of(harmonic[::2], IN_STEP)
+    assert rms_of(departure, INSIDE) < 0.15 * rms_of(hum[::2], INSIDE)
+
+
 def test_noise_alone_has_no_hum() -> None:
     for seed in range(20):
         noise = np.random.default_rng(seed).standard_normal(TIME_S.size)
         grid = FrequencyGrid(TIME_S.size, RATE_HZ)
         spectra = {"0": grid.to_spectrum(noise)}
-        assert remove_hum(spectra, grid, ~MOVING)["0"] is spectra["0"]
-        assert remove_hum(spectra, grid, MOVING & ~MOVING)["0"] is spectra["0"]
+        assert remove_hum(spectra, grid, ~MOVING, UNKNOWN_HZ)["0"] is spectra["0"]
+        assert remove_hum(spectra, grid, MOVING & ~MOVING, UNKNOWN_HZ)["0"] is spectra["0"]

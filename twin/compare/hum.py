@@ -2,6 +2,7 @@
 
 A harmonic of the drive may coincide with a line of the mains for some steps. What tells the two
 apart is time: hum is there at rest and lasts for the whole record, a harmonic belongs to its steps.
+What is in a channel while a harmonic lies at the line is never taken for hum, however weak it is.
 """
 
 import itertools
@@ -13,7 +14,7 @@ import numpy as np
 from scipy.fft import ifft, ifftshift, irfft, next_fast_len, rfft, rfftfreq
 from scipy.ndimage import binary_dilation
 
-from table_io.block import Bool2D, Float1D, Float2D, interpolate_missing
+from table_io.block import Bool1D, Bool2D, Float1D, Float2D, interpolate_missing
 from twin.compare.spectra import FrequencyGrid, Spectrum
 
 MAINS_HZ, MAINS_TOLERANCE = (50.0, 60.0), 0.002  # relative deviation of the mains frequency
@@ -40,12 +41,13 @@ class _Line(NamedTuple):
 
 
 def remove_hum(
-    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, at_rest: Bool2D
+    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, at_rest: Bool2D, drive_hz: Float1D
 ) -> dict[str, Spectrum]:
     """Return the spectra, (frequency,) each, less the hum that stands out in any of them.
 
     All channels are treated alike, so that a balance of their forces stays one. `at_rest` are the
-    samples before the motion, (sample,) at the original rate.
+    samples before the motion, `drive_hz` the frequency of the drive, NaN where it is not known;
+    (sample,) each at the original rate.
     """
     rate_hz = grid.rate_hz / grid.decimation
     records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
@@ -65,7 +67,7 @@ def remove_hum(
                 line_hz = line_hz if (is_hum & lasting).any() else resting.frequency_hz
         if is_hum.any():
             limits = np.where(is_hum, MAX_EXCESS * amplitudes, np.inf)
-            cleaned = _remove_line(cleaned, grid, line_hz, limits)
+            cleaned = _remove_line(cleaned, grid, line_hz, limits, drive_hz)
     return cleaned
 
 
@@ -140,12 +142,14 @@ def _measure_lasting_lines(records: Float2D, rate_hz: float) -> Iterator[_Line]:
 
 
 def _remove_line(
-    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, limits: Float1D
-) -> dict[str, Spectrum]:
+    spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, limits: Float1D,
+    drive_hz: Float1D,
+) -> dict[str, Spectrum]:  # fmt: skip
     """Return the spectra less one line of hum.
 
     The line is followed over time. Where its amplitude exceeds the limit of a channel, (channel,),
-    or the record ends, hum is interpolated from before and after.
+    where a harmonic of the drive lies at it, or the record ends, hum is interpolated from before
+    and after.
     """
     line_spacing = grid.rate_hz / grid.padded_size
     centre, reach = round(line_hz / line_spacing), int(FILTER_WIDTHS * LINE_WIDTH_HZ / line_spacing)
@@ -157,10 +161,14 @@ def _remove_line(
     step_s = 1.0 / (offset.size * line_spacing)
     time_s = np.arange(offset.size) * step_s
     is_loud = (np.abs(envelopes) > limits[:, None]).any(axis=0)
-    spread = math.ceil(FILTER_WIDTHS * SETTLING_S / step_s)
-    known = ~binary_dilation(is_loud, iterations=spread) if is_loud.any() else ~is_loud
+    sample = np.minimum((time_s * grid.rate_hz).astype(np.int64), drive_hz.size - 1)
+    order = np.rint(line_hz / drive_hz[sample])
+    has_harmonic = np.abs(order * drive_hz[sample] - line_hz) < FILTER_WIDTHS * LINE_WIDTH_HZ
     end_s = 2.0 * SETTLING_S
-    known &= (time_s > end_s) & (time_s < grid.size / grid.rate_hz - end_s)
+    inside = (time_s > end_s) & (time_s < grid.size / grid.rate_hz - end_s)
+    known = inside & _is_far_from(is_loud | has_harmonic, step_s)
+    if known.sum() < 2:  # a slow drive has a harmonic at every line
+        known = inside & _is_far_from(is_loud, step_s)
     if known.sum() < 2:
         return dict(spectra)
     # the envelope turns slowly: its frequency is between two lines of the spectrum
@@ -175,3 +183,9 @@ def _remove_line(
         hum = np.interp(sample_s, time_s[known], envelope[known]) * carrier
         cleaned[name] = spectrum - grid.from_time_domain(hum.real)
     return cleaned
+
+
+def _is_far_from(marked: Bool1D, step_s: float) -> Bool1D:
+    """Return the values of an envelope, (value,), on which its filter has no marked one act."""
+    spread = math.ceil(FILTER_WIDTHS * SETTLING_S / step_s)
+    return ~binary_dilation(marked, iterations=spread) if marked.any() else ~marked

@@ -529,9 +529,10 @@ def build_signals(
         key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
     }
     rest_noise = {key: value for key, value in measured.items() if value is not None}
+    without_hum = remove_hum(spectra, grid, at_rest, _find_drive_hz(block))
     signals = LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
-        grid.to_spectrum(np.ones(len(block))), remove_hum(spectra, grid, at_rest), noise,
+        grid.to_spectrum(np.ones(len(block))), without_hum, noise,
         _measure_rest(columns, at_rest, noise),
         (block.index + grid.decimation * np.arange(size)) / block.rate_hz,
         block.step[:: grid.decimation], block.label[:: grid.decimation],
@@ -551,6 +552,16 @@ def build_signals(
     removed = u - grid.apply_gain(u, gain)
     is_whole = _is_noise(signals, removed, density * (1.0 - gain))
     return replace(signals, motion_pass=gain) if is_whole else signals
+
+
+def _find_drive_hz(block: Block) -> Float1D:
+    """Return the frequency of the drive in Hz, (sample,), by the cycles of its steps; else NaN."""
+    drive_hz = np.full(len(block), np.nan)
+    for number in np.unique(block.step[block.cycle >= 0]):
+        in_step = block.step == number
+        cycles = block.cycle[in_step & (block.cycle >= 0)]
+        drive_hz[in_step] = np.unique(cycles).size / cycles.size * block.rate_hz
+    return drive_hz
 
 
 def _is_noise(signals: LogSignals, values: Float1D, density: Float1D) -> bool:
