@@ -21,10 +21,10 @@ from twin.discovery.discover import (
     discover_effects,
     prepare_problem,
 )
+from twin.discovery.evidence import build_evidence
 from twin.discovery.localization import PHASES, build_cells, classify_phases, localize_excess
 from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import EffectKey
-from twin.discovery.screening import assign_folds, build_normal_equations, rank_candidates
 from twin.discovery.selection import (
     Cancelled,
     Explanation,
@@ -32,6 +32,7 @@ from twin.discovery.selection import (
     SelectionProgress,
 )
 from twin.discovery.sensor_checks import check_sensors
+from twin.discovery.units import assign_folds
 from twin.discovery.verdict import DiscoveryVerdict, closed_fraction, judge_selection
 from twin.laws.library import EFFECTS
 
@@ -356,16 +357,16 @@ def test_where_too_much_is_recorded_the_last_cycles_say_the_same(
 
 def test_linear_algebra_foresees_what_a_refit_finds() -> None:
     prepared = prepare_problem([log(format_truth("coulomb_friction", fc=5.0))], SNM)
-    bench = prepared.problem
-    equations = build_normal_equations(bench.log_residuals, prepared.parameters, bench.library)
-    (best,) = rank_candidates(equations, 1)
-    assert best.candidate.name == "coulomb_friction"
-    refitted = bench.fit_effects(best.add_to(prepared.parameters), [best.candidate])
+    bench, start = prepared.problem, prepared.parameters
+    linear = build_evidence(bench.log_residuals, start, bench.library, {})
+    (column,) = linear.rank_states(1)[0].columns
+    variant = linear.variants[column]
+    assert variant.candidate.name == "coulomb_friction"
+    amplitude = float(linear.estimate([column])[0][0])
+    refitted = bench.fit_effects(variant.add_to(start, amplitude), [variant.candidate])
     entries = sum(residual.size for residual in refitted.held_out)
-    assert best.cost / entries == pytest.approx(refitted.cost, rel=0.02)
-    assert equations.base_cost / entries == pytest.approx(
-        bench.fit_effects(prepared.parameters, ()).cost, rel=1e-3
-    )
+    kept = (bench.fit_effects(start, ()).fit.cost - refitted.fit.cost) * entries
+    assert linear.measure_gain([column]) * linear.inflation == pytest.approx(kept, rel=0.05)
 
 
 def test_no_step_is_judged_by_a_fit_that_saw_it() -> None:

@@ -10,10 +10,9 @@ from tests.discovery.played import SNM, log
 from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import prepare_problem
-from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, build_evidence
+from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, Variant, build_evidence
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.discovery.screening import Variant
 
 ENTRIES, FORCE = 400, 100.0
 
@@ -28,7 +27,7 @@ def list_laws() -> tuple[Candidate, ...]:
 def build(columns: Float2D, residual: np.ndarray, noise: Float2D | None = None) -> LinearEvidence:
     """Evidence of columns, (column, entry), measured with products `noise` in excess."""
     count = len(columns)
-    variants = tuple(Variant(law, (), k, 0) for k, law in enumerate(list_laws()[:count]))
+    variants = tuple(Variant(law, (), 0) for law in list_laws()[:count])
     products = columns @ columns.T
     true = products if noise is None else products - noise
     scale = np.sqrt(np.diag(products))

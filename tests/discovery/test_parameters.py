@@ -21,7 +21,6 @@ from twin.discovery.parameters import (
     ParameterKey,
     ParameterSet,
     TareKey,
-    TermKey,
     get_log,
     list_base_parameters,
     list_effect_parameters,
@@ -35,7 +34,7 @@ SCALE = RecordScale(
 )  # a rig of 550 kg
 SIDES = (BaseKey("bumper_stiffness_r"), BaseKey("bumper_stiffness_l"))
 FIT_ONLY: dict[ParameterKey, float] = {
-    SLIP_SPEED: 1e-3, TermKey("damper u^5", "force"): 3.0, TareKey(1, "u"): 1e-5,
+    SLIP_SPEED: 1e-3, TareKey(1, "u"): 1e-5,
     INPUT_GAIN: 1.02, EffectKey("sensor_offset", "offset", "force_r1_n"): 4.0,
 }  # fmt: skip
 
@@ -46,7 +45,6 @@ FIT_ONLY: dict[ParameterKey, float] = {
         (STIFFNESS, "stiffness"),
         (EffectKey("bouc_wen", "force"), "bouc_wen.force"),
         (INPUT_GAIN, "sensor_gain.table_acc_m_s2.gain"),
-        (TermKey("bumper d^2 d'", "force"), "general.bumper d^2 d'.force"),
         (SLIP_SPEED, "slip"),
         (GapKey(12), "gap12"),
         (TareKey(0, "right"), "zero0.right"),

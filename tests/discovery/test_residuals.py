@@ -7,7 +7,7 @@ import pytest
 
 from tests.discovery.played import SNM, format_truth, log
 from twin.discovery.nuisances import resolve_samples
-from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet, TermKey
+from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
 
 
@@ -19,7 +19,6 @@ from twin.discovery.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
         {EffectKey("table_tilt", "tilt"): 0.1},
         {EffectKey("bouc_wen", "force"): 1e2, EffectKey("bouc_wen", "yield_displacement"): 3e-3},
         {EffectKey("bumper_maxwell", "kb"): 2e5, EffectKey("bumper_maxwell", "tau"): 0.05},
-        {TermKey("damper resonator", "force"): 10.0, TermKey("damper resonator", "width"): 3.0},
     ],
 )
 def test_forces_at_the_used_samples_are_those_of_the_whole_motion(

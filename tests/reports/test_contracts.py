@@ -31,7 +31,7 @@ VERDICT: dict[str, Any] = {
               "channels": ["damper"], "harmonics": [1, 3]},
     "gap": {"metric": "rms", "before": 9.0, "after": 1.0, "noise_floor": 1.0,
             "held_out_before": 9.0, "held_out_after": 1.0, "closed_fraction": 1.0},
-    "remainder": {"unexplained": False, "evidence": None},
+    "remainder": {"unexplained": False},
     "base": {"stiffness": INTERVAL}, "fell_away": {}, "notes": [], "next_run": "none",
     "seconds": 1.0, "held_out_logs": [],
 }  # fmt: skip

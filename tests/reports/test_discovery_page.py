@@ -171,11 +171,7 @@ def test_the_first_sentence(every: dict[str, DiscoveryOutput]) -> None:
     assert "do not determine which" in heads["ambiguous"]
     for names in every["ambiguous"].verdict.ambiguous:
         assert " with ".join(names) in heads["ambiguous"]
-    evidence = every["unexplained"].verdict.remainder.evidence
-    assert evidence is not None
-    assert f"A general law would fit: {evidence.term}." in heads["unexplained"].replace(
-        "&#39;", "'"
-    )
+    assert "lacks an effect that is not in the library" in heads["unexplained"]
 
 
 def test_a_sensor_that_errs_is_not_laid_to_the_model(
@@ -197,7 +193,7 @@ def test_what_fell_away_is_said_with_its_reason(every: dict[str, DiscoveryOutput
 def test_every_figure_is_there_and_not_empty(output: DiscoveryOutput) -> None:
     files = {path.stem: path for path in (output.folder / "figures").glob("*.png")}
     stepped = any(log.steps for log in output.logs)
-    laws = {"laws"} if output.discovery.verdict.outcome != "none" else set()
+    laws = {"laws"} if output.discovery.verdict.best.effects else set()
     assert files.keys() == laws | (
         FIGURES if stepped else FIGURES - {"map_0", "prc", "impacts", "motion"}
     )
@@ -207,16 +203,12 @@ def test_every_figure_is_there_and_not_empty(output: DiscoveryOutput) -> None:
         assert (pixels.min(axis=2) < 0.9).mean() > 0.01, name
 
 
-def test_a_term_without_a_name_is_drawn_and_never_in_the_model(
-    every: dict[str, DiscoveryOutput],
-) -> None:
+def test_what_no_effect_explains_is_drawn_without_a_law(every: dict[str, DiscoveryOutput]) -> None:
     output = every["unexplained"]
     shown = DiscoveryView(output.discovery, output.logs)
-    assert output.discovery.verdict.generic is not None
-    assert shown.law_name.startswith("generic term bumper")
-    assert [forces.is_generic for forces in shown.forces_of_each][-1]
-    assert "generic term, bumper" in output.page
-    assert "general" not in (output.folder / "model.toml").read_text()
+    assert shown.law is None
+    assert shown.forces_of_each == ()
+    assert "no effect was found that explains it" in output.page
 
 
 def test_the_law_drawn_is_the_force_that_is_missing(every: dict[str, DiscoveryOutput]) -> None:
@@ -336,9 +328,6 @@ def test_the_staircase_falls_from_the_model_as_given_to_the_noise(
         gap.noise_floor,
     ]
     assert "bumper_hardening" in stairs[2].label
-    general = every["unexplained"].verdict.staircase[-2]
-    assert "general law" in general.label
-    assert general.misfit < sizes[1]
 
 
 def test_what_is_not_named_has_a_largest_size(every: dict[str, DiscoveryOutput]) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import Discovery, PreparedLog
 from twin.discovery.held_out import compute_force_error
+from twin.discovery.hidden_effects import bound_effects, find_largest
 from twin.discovery.law_search import LawProposal
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
 from twin.discovery.nuisances import list_sizes
@@ -15,7 +16,6 @@ from twin.discovery.parameters import (
     ParameterSet,
     SlipKey,
     TareKey,
-    TermKey,
     is_correction,
     is_sensor_error,
 )
@@ -27,7 +27,6 @@ from twin.discovery.result import (
     ExplanationResult,
     FittedNuisance,
     Gap,
-    GenericTerm,
     HeldOutLog,
     Interval,
     LawClass,
@@ -87,11 +86,7 @@ def build_verdict(
             _build_effect(effect, best.fit, verdict.effects_confidence) for effect in best.effects
         ],
         ambiguous=[[*names], *([*ids] for ids in alternatives)] if alternatives else [],
-        candidates=_list_candidates(
-            selection.null,
-            (*selection.tried, *([verdict.generic] if verdict.generic else [])),
-            problem,
-        ),
+        candidates=_list_candidates(selection.null, selection.tried, problem),
         where=Location(
             frequency_hz=list(where.frequency_hz) if where.frequency_hz else None,
             direction=where.direction,
@@ -119,10 +114,7 @@ def build_verdict(
         excludes=_list_excluded_sizes(discovery),
         nuisances=_list_nuisances(discovery),
         excluded=_list_excluded(discovery),
-        remainder=Remainder(
-            unexplained=verdict.has_remainder,
-            evidence=_build_generic_term(verdict.generic, problem) if verdict.generic else None,
-        ),
+        remainder=Remainder(unexplained=verdict.has_remainder),
         law=_build_law(proposal, problem) if proposal else None,
         sensors=build_sensors(_check_discovery_sensors(discovery)),
         base=_build_base(best),
@@ -162,12 +154,8 @@ def _build_staircase(discovery: Discovery, proposal: LawProposal | None) -> list
         names = min((n for n in larger if len(n) == smallest), key=lambda n: sets[n].cost)
         steps.append((f"+ {' + '.join(sorted(names - added))}", sets[names]))
         added = names
-    generic = verdict.generic if proposal is None else None
     if proposal is not None:
         steps.append(("with the proposed law", proposal.fitted))
-    if generic is not None and verdict.outcome == "unexplained":
-        term = generic.names[-1].split(".", 1)[1]
-        steps.append((f"with the general law {term}", generic))
     problem = discovery.prepared.problem
     return [
         *(MisfitStep(label=label, misfit=problem.measure_misfit(each)) for label, each in steps),
@@ -197,24 +185,18 @@ def _list_excluded(discovery: Discovery) -> list[ExcludedSet]:
 
 def _list_excluded_sizes(discovery: Discovery) -> list[ExcludedSize]:
     """Return the largest size of each effect that is not in the best set."""
-    linear, best = discovery.selection.evidence, discovery.verdict.best
-    if linear is None:
-        return []
-    kept = [linear.find_column(effect, best.find_shape(effect)) for effect in best.effects]
-    largest: dict[str, ExcludedSize] = {}
-    for column, variant in enumerate(linear.variants):
-        candidate = variant.candidate
-        if candidate.name in best.names or not linear.scale[column] > 0:
-            continue
-        value, share = linear.bound_amplitude(column, [k for k in kept if k is not None])
-        size = ExcludedSize(
-            id=candidate.name, parameter=str(candidate.amplitude.key).rsplit(".", 1)[-1],
-            value=value, unit=candidate.amplitude.unit, force_share=share,
-        )  # fmt: skip
-        known = largest.get(candidate.name)
-        if known is None or share > known.force_share:
-            largest[candidate.name] = size
-    return sorted(largest.values(), key=lambda size: size.force_share)
+    effects = bound_effects(discovery.selection.evidence, discovery.verdict.best)
+    largest = sorted(map(find_largest, effects), key=lambda effect: effect.share)
+    return [
+        ExcludedSize(
+            id=effect.candidate.name,
+            parameter=str(effect.candidate.amplitude.key).rsplit(".", 1)[-1],
+            value=abs(effect.deviation),
+            unit=effect.candidate.amplitude.unit,
+            force_share=effect.share,
+        )
+        for effect in largest
+    ]
 
 
 def _list_nuisances(discovery: Discovery) -> list[FittedNuisance]:
@@ -298,7 +280,7 @@ def build_sensors(checks: Sequence[SensorCheck]) -> Sensors:
 def _build_effect(candidate: Candidate, fit: FitResult, confidence: float) -> EffectResult:
     """Return an effect with its confidence and its parameters, each with its 95 % interval."""
     effect = EffectResult(
-        id=candidate.effect.id if candidate.effect else candidate.name,
+        id=candidate.effect.id,
         confidence=confidence,
         parameters=_build_parameters(candidate, fit),
     )
@@ -314,7 +296,7 @@ def _build_parameters(candidate: Candidate, fit: FitResult) -> dict[str, Interva
     return {
         free.key.name: build_parameter(fit, free)
         for free in candidate.free
-        if isinstance(free.key, EffectKey | TermKey)
+        if isinstance(free.key, EffectKey)
     }
 
 
@@ -390,21 +372,6 @@ def _list_candidates(
             candidate.at_bound = [*map(str, fitted.fit.at_bound)]
         candidates.append(candidate)
     return candidates
-
-
-def _build_generic_term(general: FittedSet, problem: SelectionProblem) -> GenericTerm:
-    """Return the generic term that fits better than every library effect."""
-    term = general.effects[-1]
-    return GenericTerm(
-        term=term.name.split(".", 1)[1],
-        meaning="u, v, d relative to their largest measured values, w likewise (resonator: Hz)",
-        held_out_error=problem.measure_misfit(general),
-        parameters={
-            free.key.name: build_parameter(general.fit, free)
-            for free in term.free
-            if isinstance(free.key, TermKey)
-        },
-    )
 
 
 def _build_law(proposal: LawProposal, problem: SelectionProblem) -> ProposedLaw:

@@ -14,19 +14,16 @@ import numpy as np
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import (
-    GENERIC_PREFIX,
     SLIP_SPEED,
     FreeParameter,
     ParameterKey,
     ParameterSet,
-    TermKey,
     list_effect_parameters,
     measure_size,
 )
 from twin.discovery.residuals import LogResiduals
 from twin.laws.effect import Effect, EffectParameter
 from twin.laws.library import EFFECTS, load_plugins
-from twin.laws.terms import GENERIC_TERMS
 
 LADDER_LENGTH = 9
 # of the largest velocity: trial values; friction near zero velocity varies
@@ -43,17 +40,14 @@ INSTRUMENT_REASON = "an error of an instrument: sensors judge sensors, no force 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """Candidate effect with a ladder of trial shapes.
-
-    `effect` is None for a generic term, which represents effects outside the library.
-    """
+    """Candidate effect with a ladder of trial shapes."""
 
     name: str
     free: tuple[FreeParameter, ...]
     amplitude: FreeParameter  # the one of `free` that makes the effect vanish
     vanishing: float
     shapes: tuple[tuple[float, ...], ...]  # trial values of the other parameters, in their order
-    effect: Effect | None = None
+    effect: Effect
     channel: str = ""
     constants: Mapping[ParameterKey, float] = field(default_factory=dict)  # fixed values
     # Deviations of the amplitude over which its slope is taken; 0: where it vanishes.
@@ -90,8 +84,7 @@ class Candidate:
         shape_keys = [free.key for free in self.free if free is not self.amplitude]
         values = {**self.constants, **dict(zip(shape_keys, shape, strict=True))}
         values[self.amplitude.key] = self.vanishing if amplitude is None else amplitude
-        if self.effect is not None:
-            parameters = parameters.with_effect(self.effect)
+        parameters = parameters.with_effect(self.effect)
         return parameters.with_values(values).with_free((*parameters.free, *self.free))
 
     def remove_from(self, parameters: ParameterSet) -> ParameterSet:
@@ -99,28 +92,6 @@ class Candidate:
         reduced = parameters.without(self.free)
         values = {key: v for key, v in reduced.values.items() if key not in self.constants}
         return replace(reduced, values=values)
-
-
-def list_generic_candidates(log_residuals: Sequence[LogResiduals]) -> tuple[Candidate, ...]:
-    """Return the generic terms as candidates: amplitude in N, and width if it has one."""
-    candidates, scale = [], log_residuals[0].scale
-    has_contact = any((residuals.contact_state > 0).any() for residuals in log_residuals)
-    for term in GENERIC_TERMS.values():
-        if term.place != "damper" and not has_contact:
-            continue
-        free = [
-            FreeParameter(
-                TermKey(term.name, "force"), -np.inf, np.inf, scale.force, "N", vanishing=0.0
-            )
-        ]
-        for ladder in term.shapes.values():
-            low, high = 0.3 * ladder[0], 3.0 * ladder[-1]
-            key = TermKey(term.name, "width")
-            free.append(FreeParameter(key, low, high, ladder[0], "", logarithmic=True))
-        name = f"{GENERIC_PREFIX}.{term.name}"
-        shapes = tuple(product(*term.shapes.values()))
-        candidates.append(Candidate(name, tuple(free), free[0], 0.0, shapes))
-    return tuple(candidates)
 
 
 def list_candidates(

@@ -301,7 +301,7 @@ def propose_tests(
     `law` is the set with a law that was proposed for what the library does not explain.
     """
     problem = discovery.prepared.problem
-    rivals = list_rivals(problem, discovery.selection, discovery.verdict, law)
+    rivals = list_rivals(discovery.selection, discovery.verdict, law)
     by_title = {test.title: test for test in tests}
     motions = [test.motion for test in by_title.values()]
     return [

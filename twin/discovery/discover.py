@@ -39,6 +39,7 @@ from twin.discovery.residuals import MAX_GAP_ERROR_M, LogResiduals, build_log_re
 from twin.discovery.selection import (
     FittedSet,
     ProgressCallback,
+    RoundEffort,
     SelectionProblem,
     SelectionProgress,
     SelectionResult,
@@ -279,7 +280,8 @@ def discover_effects(
     """
     report(SelectionProgress("the model alone"))
     prepared = prepare_problem(logs, model, without, mapper)
-    selection = select_effects(prepared.problem, prepared.parameters, report, rounds=1)
+    once = (RoundEffort(),)
+    selection = select_effects(prepared.problem, prepared.parameters, report, rounds=once)
     if selection.best.effects and selection.complete:
         # the errors of instruments were linear about a model without these effects
         prepared = _linearize_about(prepared, selection.best)
@@ -326,7 +328,7 @@ def _judge(
     verdict = widen_for_form(judge_selection(problem, selection, floor))
     widened = widen_intervals(verdict.best.fit, problem.log_residuals)
     verdict = replace(verdict, best=replace(verdict.best, fit=widened))
-    verdict = qualify_none(problem, verdict)
+    verdict = qualify_none(selection, verdict)
     # implausible base parameters are reported only if they remain so with the effects added
     pulls = find_pulling_bumpers(problem.log_residuals, verdict.best.held_out)
     notes = (*prepared.notes, *find_implausible_parameters(model, verdict.best.fit), *pulls)

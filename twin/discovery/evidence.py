@@ -29,8 +29,8 @@ from twin.discovery.candidates import Candidate
 from twin.discovery.least_squares import INTERVAL_SIGMA, MapFunction, compute_slopes
 from twin.discovery.parameters import FreeParameter, ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.discovery.screening import Variant, assign_units
 from twin.discovery.strangers import compute_stranger_forces
+from twin.discovery.units import assign_units
 
 EFFECT_SHARE = 0.1  # standard deviation of an effect's force over that of the record, before a test
 STRANGER_SHARES = (0.003, 0.01, 0.03, 0.1)  # the same for the stranger, each as likely
@@ -41,6 +41,21 @@ PAIR_STARTS, TRIPLE_STARTS, STRANGER_STARTS = 40, 12, 12  # sets that are extend
 RICHEST_EFFECTS = 3  # beside the stranger, in the model that shows the noise
 MIN_BASE_SHARE = 1e-12  # of the curvature of the base: directions with less are left out
 MIN_INFORMATION_SHARE = 1e-9  # of a column's norm: with less left, other parameters imitate it
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """Candidate with one of its trial shapes."""
+
+    candidate: Candidate
+    shape: tuple[float, ...]
+    sign: int  # of the amplitudes allowed: +1, -1, or 0 for both
+
+    def add_to(self, parameters: ParameterSet, amplitude: float) -> ParameterSet:
+        """Add the candidate to a parameter set with so much more than its vanishing amplitude."""
+        free = self.candidate.amplitude
+        start = self.candidate.vanishing + amplitude
+        return self.candidate.add_to(parameters, self.shape, min(max(start, free.low), free.high))
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +151,8 @@ class LinearEvidence:
     def bound_amplitude(self, column: int, beside: Sequence[int]) -> tuple[float, float]:
         """Return (end of the 95 % interval of an amplitude, its force over that of the record).
 
-        Beside the columns of other effects, and with no prior: what the recordings alone say.
+        The end on the side of the estimate, or of the sign allowed. Beside the columns of other
+        effects, and with no prior: what the recordings alone say.
         """
         chosen = [column, *(k for k in beside if k != column)]
         (information,), (g,) = self._inform(np.array([chosen]))
@@ -145,7 +161,8 @@ class LinearEvidence:
         covariance /= np.outer(size, size)
         amplitude = float(covariance[0] @ g)
         end = abs(amplitude) + INTERVAL_SIGMA * math.sqrt(max(float(covariance[0, 0]), 0.0))
-        return end, end * float(self.scale[column]) / self.force
+        sign = self.variants[column].sign or math.copysign(1.0, amplitude)
+        return sign * end, end * float(self.scale[column]) / self.force
 
     def measure_gain(self, columns: Sequence[int]) -> float:
         """Return the residual squares, over the inflation, that a set removes at its maximum."""
@@ -251,7 +268,7 @@ def build_evidence(
         known = known_shapes.get(candidate.name)
         shapes = dict.fromkeys((*candidate.shapes, *([known] if known else [])))
         for shape, probe in product(shapes, candidate.probes):
-            variants.append(Variant(candidate, shape, len(variants), sign))
+            variants.append(Variant(candidate, shape, sign))
             requests.append((candidate.add_to(parameters, shape), amplitude, probe))
 
     columns, places = _fill_columns(log_residuals, parameters, requests, len(variants), mapper)

@@ -35,7 +35,6 @@ from twin.discovery.parameters import (
     ParameterKey,
     ParameterSet,
     TareKey,
-    TermKey,
     get_log,
     list_base_parameters,
 )
@@ -87,11 +86,6 @@ class Rival:
     name: str
     fitted: FittedSet
     is_held: bool = False
-
-    @property
-    def can_be_simulated(self) -> bool:
-        """False with a generic term, which is a shape along a measured motion, no model."""
-        return not any(isinstance(key, TermKey) for key in self.fitted.fit.parameters.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,16 +184,14 @@ def _mean(values: Sequence[float] | Float1D) -> float:
 
 
 def list_rivals(
-    problem: SelectionProblem,
     selection: SelectionResult,
     verdict: DiscoveryVerdict,
     law: FittedSet | None = None,
 ) -> tuple[Rival, ...]:
     """Return the explanations that the recordings leave open, the best first.
 
-    Besides the best set: that with a proposed `law`, the sets as good as it, the one with a generic
-    term that fits better, the sets with one effect more that fit a remainder, and where nothing is
-    explained the next best.
+    Besides the best set: that with a proposed `law`, the sets as good as it, the sets with one
+    effect more that fit a remainder, and where nothing is explained the next best.
     Where nothing is open, the ends of the widest interval; where all are narrow, the effects to
     which the recordings are blind, or without such those that the noise may hide.
     """
@@ -221,7 +213,6 @@ def list_rivals(
     others = [
         *([law] if law is not None else []),
         *verdict.alternatives,
-        *([verdict.generic] if verdict.generic is not None else []),
         *sorted(larger.values(), key=lambda fitted: fitted.cost),
         *competing,
     ]
@@ -230,9 +221,10 @@ def list_rivals(
     others = [*reversed(distinct.values())][: MAX_RIVALS - 1]
     if others:
         return tuple(Rival(name_set(fitted), fitted) for fitted in (best, *others))
+    hidden = verdict.blind_to or find_hidden_effects(selection.evidence, best)
     return find_interval_ends(best) or (
         Rival(name_set(best), best),
-        *add_hidden_effects(best, verdict.blind_to or find_hidden_effects(problem, best)),
+        *add_hidden_effects(best, hidden),
     )
 
 
@@ -343,7 +335,7 @@ def _predict_pairs(
     pairs, simulated = [], {}
     for truth, rival in enumerate(rivals):
         others = [index for index, other in enumerate(rivals) if _is_separable(rival, other)]
-        if not others or not rival.can_be_simulated or (truth and is_confirmation(rivals)):
+        if not others or (truth and is_confirmation(rivals)):
             continue
         last = problem.log_residuals[-1]
         try:

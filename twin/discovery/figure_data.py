@@ -19,7 +19,7 @@ from twin.discovery.law_search import LawProposal
 from twin.discovery.localization import PHASES, classify_phases, is_stepped_sine
 from twin.discovery.motion import MeasuredMotion
 from twin.discovery.nuisances import resolve_samples
-from twin.discovery.parameters import GENERIC_PREFIX, ParameterSet
+from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.selection import FittedSet
 
@@ -51,7 +51,6 @@ class TermForces:
     """
 
     label: str
-    is_generic: bool
     required: Float2D
     law: Float2D
 
@@ -119,28 +118,13 @@ class DiscoveryView:
 
     @property
     def law(self) -> FittedSet | None:
-        """Set whose force is drawn: that of the effects named, else that with the generic term.
-
-        None if nothing was found.
-        """
-        if self.proposal is not None:
-            return self.proposal.fitted
-        v = self.discovery.verdict
-        if v.generic is not None and (v.outcome == "unexplained" or not v.best.effects):
-            return v.generic
-        return v.best if v.best.effects else None
+        """Set whose force is drawn; None if nothing was found."""
+        return self._best if self._best.effects else None
 
     @property
     def law_name(self) -> str:
-        """Names of the terms whose force is drawn; a generic one is called so."""
-        return " + ".join(format_term(term) for term in self._drawn_terms)
-
-    @property
-    def _drawn_terms(self) -> tuple[Candidate, ...]:
-        if self.law is None:
-            return ()
-        is_generic = self.law is self.discovery.verdict.generic
-        return self.law.effects[-1:] if is_generic else self.law.effects
+        """Names of the terms whose force is drawn."""
+        return " + ".join(format_term(term) for term in self._best.effects)
 
     def title_suffix(self, number: int) -> str:
         """Return " · log name" to append to a title; empty with a single log."""
@@ -166,27 +150,22 @@ class DiscoveryView:
         if self.law is None:
             return None
         residuals = self.log_residuals[self.worst_log]
-        return compute_term_forces(residuals, self.law.fit.parameters, self._drawn_terms)
+        return compute_term_forces(residuals, self.law.fit.parameters, self.law.effects)
 
     @cached_property
     def forces_of_each(self) -> tuple[TermForces, ...]:
-        """Forces of each effect found, then of the generic term; sensor errors have none."""
-        generic, residuals = self.discovery.verdict.generic, self.log_residuals[self.worst_log]
-        pairs = [(self._best, term) for term in self._best.effects if not term.channel]
-        if generic is not None and self.proposal is None:
-            pairs.append((generic, generic.effects[-1]))
+        """Forces of each effect found; sensor errors have none."""
+        residuals, parameters = self.log_residuals[self.worst_log], self._best.fit.parameters
         return tuple(
-            compute_term_forces(residuals, fitted.fit.parameters, [term]) for fitted, term in pairs
+            compute_term_forces(residuals, parameters, [term])
+            for term in self._best.effects
+            if not term.channel
         )
 
 
 def format_term(term: Candidate) -> str:
-    """Return the name of an effect for a reader; a term outside the library is called generic."""
-    if term.effect is not None and term.effect.is_of_file:
-        return f"{term.effect.title}: {term.effect.force}"
-    if term.effect is not None:
-        return term.name
-    return f"generic term {term.name.removeprefix(f'{GENERIC_PREFIX}.')} (no effect of the library)"
+    """Return the name of an effect for a reader."""
+    return f"{term.effect.title}: {term.effect.force}" if term.effect.is_of_file else term.name
 
 
 def compute_term_forces(
@@ -210,8 +189,7 @@ def compute_term_forces(
     unused = ~residuals.row_mask[: len(FORCE_ROWS)]
     required[unused], remaining[unused] = np.nan, np.nan
     label = " + ".join(format_term(term) for term in terms)
-    is_generic = any(term.effect is None for term in terms)
-    return TermForces(label, is_generic, required, required - remaining)
+    return TermForces(label, required, required - remaining)
 
 
 def entries_to_samples(

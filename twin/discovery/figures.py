@@ -18,14 +18,10 @@ from matplotlib.patches import Patch
 from table_io.block import Float1D, Float2D
 from table_io.records import Step
 from twin.discovery.figure_data import DiscoveryView, is_periodic, list_phases
-from twin.discovery.force_figures import (
-    GENERIC_COLOUR,
-    draw_force_histories,
-    draw_residual_forces,
-)
+from twin.discovery.force_figures import draw_force_histories, draw_residual_forces
 from twin.discovery.free_running import FreeRuns
 from twin.discovery.localization import ResidualCell
-from twin.discovery.parameters import GENERIC_PREFIX, TARE_PREFIX
+from twin.discovery.parameters import TARE_PREFIX
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
 from twin.discovery.result import CandidateResult, DecisiveTest, Verdict
 from twin.discovery.twin_figures import draw_free_running
@@ -72,11 +68,8 @@ def _draw_staircase(verdict: Verdict) -> CaptionedFigures:
     ax = figure.subplots()
     floor = sizes[-1]
     bottom = 0.5 * min(sizes)
-    for number, (step, size) in enumerate(zip(steps[:-1], sizes, strict=False)):
-        is_generic = "general law" in step.label
-        colour = (GIVEN_COLOUR, BEFORE_COLOUR, GENERIC_COLOUR if is_generic else BEST_COLOUR)[
-            min(number, 2)
-        ]
+    for number, size in enumerate(sizes[:-1]):
+        colour = (GIVEN_COLOUR, BEFORE_COLOUR, BEST_COLOUR)[min(number, 2)]
         ax.bar(number, size - bottom, bottom=bottom, width=0.62, color=colour)
         ax.annotate(f"{size:.3g} ×", (number, size), (0, 3), textcoords="offset points",
                     ha="center", weight="bold")  # fmt: skip
@@ -248,11 +241,7 @@ def _draw_candidates(verdict: Verdict) -> CaptionedFigures:
             (-4 if inside else 4, 0), textcoords="offset points", va="center", size=7.5,
             ha="right" if inside else "left", color=TWIN_COLOUR if inside else GUIDE_COLOUR,
         )  # fmt: skip
-    ax.set_yticks(
-        range(len(sets)),
-        [candidate.id.replace(f"{GENERIC_PREFIX}.", "") for candidate in sets],
-        size=8,
-    )
+    ax.set_yticks(range(len(sets)), [candidate.id for candidate in sets], size=8)
     ax.set_ylim(len(sets) - 0.4, -0.6)
     if is_log_scale:
         ax.set_xscale("log")
@@ -264,7 +253,7 @@ def _draw_candidates(verdict: Verdict) -> CaptionedFigures:
     ax.grid(visible=False, axis="y")
     ax.set_xlabel("rms of measured minus model over the noise, held out")
     kinds = {"nothing added": BEFORE_COLOUR, "selected": BEST_COLOUR,
-             "other effects": "#9db7d5", "with a generic term": GENERIC_COLOUR}  # fmt: skip
+             "other effects": "#9db7d5"}  # fmt: skip
     colours = {_bar_colour(candidate, null, added_ids) for candidate in sets}
     handles = [Patch(color=c, label=text) for text, c in kinds.items() if c in colours]
     all_handles = [*handles, Line2D([], [], color=TWIN_COLOUR, ls="--", label="noise floor")]
@@ -283,18 +272,12 @@ def _format_doubts(candidate: CandidateResult) -> str:
     """Return remarks on a fit: not converged, parameters at a bound (tare errors do not count)."""
     at_bound = [name for name in candidate.at_bound if not name.startswith(TARE_PREFIX)]
     text = "" if candidate.converged else ", not converged"
-    return (
-        f"{text}, {at_bound[0].removeprefix(f'{GENERIC_PREFIX}.')} at its bound"
-        if at_bound
-        else text
-    )
+    return f"{text}, {at_bound[0]} at its bound" if at_bound else text
 
 
 def _bar_colour(candidate: CandidateResult, null: CandidateResult, added_ids: set[str]) -> str:
     if candidate is null:
         return BEFORE_COLOUR
-    if GENERIC_PREFIX in candidate.id:
-        return GENERIC_COLOUR
     return BEST_COLOUR if set(candidate.id.split(" + ")) == added_ids else "#9db7d5"
 
 

@@ -35,7 +35,6 @@ from twin.drawing.plot_style import (
 
 SIDES = ("right", "left")  # of residual rows 1 and 2
 FORCE_NAMES = ("damper", "right bumper", "left bumper")
-GENERIC_COLOUR = "#d98a1f"
 MAX_POINTS = 6000  # of a cloud
 MIN_CYCLE_SAMPLES = 25.0  # of the main motion, for a line through the samples
 
@@ -84,9 +83,9 @@ def _draw_laws(view: DiscoveryView) -> CaptionedFigures:
         sign = -1.0 if row == 2 else 1.0
         depth = sign * m.u - (m.gaps_m[row - 1] if row else 0.0)
         names = ("depth in mm", "rate of depth in mm/s") if row else ("$u$ in mm", "$u'$ in mm/s")
-        colour = GENERIC_COLOUR if forces.is_generic else DIRECTION_COLOURS["forward"]
+        measured = forces.required[row, used]
         for ax, x, name in zip(row_axes, (depth, sign * m.v), names, strict=True):
-            _draw_loop(ax, (1e3 * x[used], forces.required[row, used]), colour)
+            _draw_loop(ax, (1e3 * x[used], measured), DIRECTION_COLOURS["forward"])
             ax.xaxis.set_major_locator(MaxNLocator(6))
             ax.plot(1e3 * x[used], forces.law[row, used], ".", color=TWIN_COLOUR, ms=1.1, mew=0)
             ax.set_xlabel(name)
@@ -98,23 +97,17 @@ def _draw_laws(view: DiscoveryView) -> CaptionedFigures:
             color=GUIDE_COLOUR,
         )  # fmt: skip
         row_axes[0].set_ylabel("force in N")
-    kinds = {
-        False: ("required of the effect", DIRECTION_COLOURS["forward"]),
-        True: ("required of the generic term, no effect of the library", GENERIC_COLOUR),
-    }
     handles = [
-        Line2D([], [], color=colour, marker=".", ls="", ms=7, label=text)
-        for generic, (text, colour) in kinds.items()
-        if any(forces.is_generic == generic for forces in drawn)
+        Line2D([], [], color=colour, marker=".", ls="", ms=size, label=text)
+        for text, colour, size in (
+            ("required of the effect", DIRECTION_COLOURS["forward"], 7),
+            ("the law as fitted", TWIN_COLOUR, 4),
+        )
     ]
-    handles.append(
-        Line2D([], [], color=TWIN_COLOUR, marker=".", ls="", ms=4, label="the law as fitted")
-    )
     figure.legend(handles=handles, loc="outside upper center", ncols=3)
     caption = (
         "What measurement requires of each law, measured force minus that of the model without it, "
-        "and the law itself, over the whole log with the largest residual. A generic term stands "
-        "for what is not in the library and never enters a model."
+        "and the law itself, over the whole log with the largest residual."
     )
     title = f"Force of what was found, measured and fitted{view.title_suffix(view.worst_log)}"
     yield CaptionedFigure("laws", title, caption, figure)

@@ -1,45 +1,37 @@
 """Search for a force law where no effect of the library explains a residual.
 
-Terms of `law_terms` are screened, refitted with the base in the same likelihood and judged on
-held-out steps, as effects are: forward selection with a small beam, over all classes at once. Where
-they do not suffice, expressions of symbolic regression are judged in the same way.
-Exponents that the data allow to be round are rounded.
+Terms of `law_terms` compete with each other, and beside the effects that were found, by the
+evidence of their sets, as effects do (`selection`): single terms of all classes first, then pairs.
+Where they do not suffice, expressions of symbolic regression are judged in the same way. Exponents
+that the data allow to be round are rounded.
 """
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import Discovery
-from twin.discovery.law_terms import (
-    find_law_class,
-    list_law_candidates,
-    round_exponent,
-)
+from twin.discovery.law_terms import find_law_class, list_law_candidates, round_exponent
 from twin.discovery.parameters import EffectKey, ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.discovery.screening import build_normal_equations
 from twin.discovery.selection import (
     FittedSet,
     ProgressCallback,
+    RoundEffort,
     SelectionProblem,
-    SelectionProgress,
-    fit_without,
-    select_promising,
+    select_effects,
 )
 from twin.discovery.symbolic_regression import list_symbolic_candidates
 from twin.discovery.verdict import closed_fraction
 from twin.laws.effect import Effect, Place
 from twin.model.valid_range import list_inputs
 
-FIRST_REFITS, NEXT_REFITS, BEAM_WIDTH = 8, 4, 3
-MAX_EXPLAINED_RATIO = 1.05  # of the mean square to the noise: with less no second term is tried
-MIN_FIRST_GAIN = 0.3  # of the excess over the noise: a term that gains less is given no second one
+MAX_TERMS = 2  # of a law
+FIRST_REFITS, NEXT_REFITS = 8, 6  # sets that are refitted in each round, at most
+PROMISE_SHARE = 0.3  # of the best log evidence: sets that promise less than the rest are left out
 MIN_CLOSED_SHARE = 0.5  # of the misfit that a law must close to be proposed
-SUFFICIENT_RATIO = 1.1  # times the noise, held out: with less, the law explains the record
 MAX_WORSE_SIGMA = 2.0  # standard errors by which a law with a rounded exponent may be worse
 MAX_WORSE_SHARE = 1e-4  # of the held-out squares, which no one would miss
 
@@ -57,14 +49,10 @@ class LawProposal:
     start: FittedSet
     laws: tuple[Effect, ...]
     misfit: float  # held out, rms over the noise of the sensors
+    is_sufficient: bool  # what it leaves is noise
     nearest: str
     law_class: str
     by_class: tuple[tuple[str, FittedSet], ...]
-
-    @property
-    def is_sufficient(self) -> bool:
-        """True if the law leaves at most `SUFFICIENT_RATIO` times the noise."""
-        return self.misfit <= SUFFICIENT_RATIO
 
 
 def is_explained(discovery: Discovery) -> bool:
@@ -82,127 +70,108 @@ def propose_law(
     """
     if is_explained(discovery):
         return None
-    verdict, selection = discovery.verdict, discovery.selection
-    starts = [selection.null, *([verdict.best] if verdict.best.effects else [])]
+    selection, problem = discovery.selection, discovery.prepared.problem
     singles = [fitted for fitted in selection.tried if len(fitted.effects) == 1]
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
-    nearest_name = nearest.names[0] if nearest else ""
-    problem = discovery.prepared.problem
-    return select_law(problem, starts, search_laws(problem, starts, report), nearest_name)
+    null, best = selection.null, discovery.verdict.best
+    fitted_sets = search_laws(problem, null, best, report)
+    return select_law(problem, null, fitted_sets, nearest.names[0] if nearest else "")
 
 
 def select_law(
     problem: SelectionProblem,
-    starts: Sequence[FittedSet],
+    null: FittedSet,
     fitted_sets: Sequence[FittedSet],
     nearest: str = "",
 ) -> LawProposal | None:
-    """Return the law, among the sets fitted, that explains most of what the first start leaves.
+    """Return the law, among the sets fitted, that explains most of what no effect does.
 
     None if none helps.
     """
     if not fitted_sets:
         return None
     best = _round_exponents(problem, _select_simplest(problem, fitted_sets))
-    start = max(
-        (start for start in starts if start.effects == best.effects[: len(start.effects)]),
-        key=lambda start: len(start.effects),
-    )
-    before, after = problem.measure_misfit(starts[0]), problem.measure_misfit(best)
+    before, after = problem.measure_misfit(null), problem.measure_misfit(best)
     closed_share = closed_fraction(before, after, problem.find_noise_floor(best))
+    start = _drop_laws(problem, null, best)
     if closed_share < MIN_CLOSED_SHARE or not problem.is_worthwhile(start, best):
         return None
     terms = best.effects[len(start.effects) :]
     laws = tuple(_describe_law(problem, best, term, nearest) for term in terms)
-    law_class = find_law_class(terms[0])
     return LawProposal(
-        best, start, laws, after, nearest, law_class, _list_best_by_class(fitted_sets)
-    )
+        best, start, laws, after, problem.leaves_noise(best), nearest,
+        find_law_class(terms[0]), _list_best_by_class(fitted_sets),
+    )  # fmt: skip
+
+
+def _drop_laws(problem: SelectionProblem, null: FittedSet, fitted: FittedSet) -> FittedSet:
+    """Return a set refitted without its terms of a law: its effects of the library come first."""
+    effects = tuple(effect for effect in fitted.effects if not find_law_class(effect))
+    if not effects:
+        return null
+    parameters = fitted.fit.parameters
+    for term in fitted.effects[len(effects) :]:
+        parameters = term.remove_from(parameters)
+    return problem.fit_effects(parameters, effects)
 
 
 def search_laws(
     problem: SelectionProblem,
-    starts: Sequence[FittedSet],
+    null: FittedSet,
+    best: FittedSet,
     report: ProgressCallback = lambda progress: None,
 ) -> list[FittedSet]:
-    """Return the sets of a start and one or two terms that were fitted, best first.
+    """Return the sets with one or two terms that were fitted, best first.
 
-    Later starts are tried only if the earlier ones lead to no explanation, and to none as good.
+    Beside them the effects of `best` may stay, or some of them.
     """
     # without load cells contact is unknown, not absent
     has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
-    known = [str(key) for key in starts[0].fit.parameters.values]
-    library = [
+    known = [str(key) for key in null.fit.parameters.values]
+    terms = [
         term
         for term in list_law_candidates(problem.log_residuals[0].scale, has_contact)
         if not any(name.startswith(f"{term.name}.") for name in known)  # of the model already
     ]
-    fitted_sets: list[FittedSet] = []
-    for start in starts:
-        reached = min((fitted.cost for fitted in fitted_sets), default=math.inf)
-        if not _explains(problem, fitted_sets) and start.cost < reached:
-            fitted_sets += _search_from(problem, start, library, report)
-    if not _explains(problem, [*starts, *fitted_sets]):
-        expressions = list_symbolic_candidates(problem.log_residuals, starts[0].fit.parameters)
+    fitted_sets = _search_from(problem, null, (*best.effects, *terms), report)
+    if not any(map(problem.leaves_noise, fitted_sets[:1])):
+        expressions = list_symbolic_candidates(problem.log_residuals, null.fit.parameters)
         if expressions:
-            fitted_sets += _extend(problem, starts[0], expressions, NEXT_REFITS, report)
+            fitted_sets += _search_from(problem, null, (*best.effects, *expressions), report)
     return sorted(fitted_sets, key=lambda fitted: fitted.cost)
 
 
 def _search_from(
     problem: SelectionProblem,
-    start: FittedSet,
+    null: FittedSet,
     library: Sequence[Candidate],
     report: ProgressCallback,
 ) -> list[FittedSet]:
-    """Return the sets of `start` and one or two terms that were fitted."""
-    fitted_sets = _extend(problem, start, library, FIRST_REFITS, report)
-    for current in fitted_sets[:BEAM_WIDTH]:
-        excess = start.cost - problem.expected_square
-        if _explains(problem, fitted_sets) or start.cost - current.cost < MIN_FIRST_GAIN * excess:
-            break
-        further = [term for term in library if term.name not in current.names]
-        reached = min(fitted.cost for fitted in fitted_sets)
-        fitted_sets += _extend(problem, current, further, NEXT_REFITS, report, reached)
-    best = min(fitted_sets, key=lambda fitted: fitted.cost, default=start)
-    names = (*start.names, *best.names[-1:])
-    if len(best.effects) == len(start.effects) + 2 and all(
-        fitted.names != names for fitted in fitted_sets
-    ):
-        # the first term may only have stood in for the second, which screening alone did not show
-        report(SelectionProgress("a law", names, 1, 1, best))
-        fitted_sets.append(fit_without(problem, best, best.effects[-2]))
-    return fitted_sets
+    """Return the sets of a library with a term of a law that were fitted, best first."""
+    known = sum(not find_law_class(effect) for effect in library)
+    rounds = [
+        RoundEffort("a law", count + known, refits, PROMISE_SHARE, if_open=count > 1)
+        for count, refits in zip(range(1, MAX_TERMS + 1), (FIRST_REFITS, NEXT_REFITS), strict=True)
+    ]
+    laws = replace(problem, library=tuple(library))
+    selection = select_effects(laws, null.fit.parameters, report, rounds=rounds)
+    with_law = [each for each in selection.tried if any(map(find_law_class, each.effects))]
+    with_law += _drop_terms(laws, with_law) if with_law else ()
+    return sorted(with_law, key=lambda fitted: fitted.cost)
 
 
-def _explains(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> bool:
-    """Return whether one of the sets leaves hardly more than noise."""
-    return any(fitted.cost <= MAX_EXPLAINED_RATIO * problem.noise for fitted in fitted_sets)
+def _drop_terms(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> Iterator[FittedSet]:
+    """Yield the best set without each of its terms, where it has several and that is not fitted.
 
-
-def _extend(
-    problem: SelectionProblem,
-    current: FittedSet,
-    library: Sequence[Candidate],
-    max_refits: int,
-    report: ProgressCallback,
-    reached: float = math.inf,
-) -> list[FittedSet]:
-    """Return the sets of `current` and the best screened terms, each refitted, best first.
-
-    Terms that promise far less than another set has `reached` are left out.
+    One may only have stood in for another, which a ladder of shapes did not show.
     """
-    parameters = current.fit.parameters
-    equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
-    fitted_sets: list[FittedSet] = []
-    screened_terms = select_promising(equations, max_refits, reached / max(current.cost, 1e-300))
-    for index, screened in enumerate(screened_terms, 1):
-        effects = (*current.effects, screened.candidate)
-        names = tuple(effect.name for effect in effects)
-        best = min((current, *fitted_sets), key=lambda fitted: fitted.cost)
-        report(SelectionProgress("a law", names, index, len(screened_terms), best))
-        fitted_sets.append(problem.fit_effects(screened.add_to(parameters), effects))
-    return sorted(fitted_sets, key=lambda fitted: fitted.cost)
+    best = min(fitted_sets, key=lambda fitted: fitted.cost)
+    terms = [term for term in best.effects if find_law_class(term)]
+    known = {frozenset(fitted.names) for fitted in fitted_sets}
+    for dropped in terms if len(terms) > 1 else ():
+        kept = tuple(effect for effect in best.effects if effect is not dropped)
+        if frozenset(effect.name for effect in kept) not in known:
+            yield problem.fit_effects(dropped.remove_from(best.fit.parameters), kept)
 
 
 def _select_simplest(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> FittedSet:
@@ -253,7 +222,6 @@ def _describe_law(
 ) -> Effect:
     """Return the effect of a fitted term: its values as typical ones, its measured range."""
     law = term.effect
-    assert law is not None
     parameters = []
     for own in law.parameters:
         value = fitted.fit.parameters.values[EffectKey(term.name, own.name)]

@@ -179,7 +179,6 @@ def round_exponent(
     if family is None or family.power is None or key not in parameters.values:
         return None
     law, (variable, is_odd) = term.effect, family.power
-    assert law is not None
     reference = f"{variable}0"
     exponent = min(ROUND_EXPONENTS, key=lambda value: abs(value - parameters.values[key]))
     reference_value = parameters.values[EffectKey(term.name, reference)]

@@ -17,8 +17,8 @@ from twin.discovery.free_running import compute_misfits, run_logs_free
 from twin.discovery.identify_figures import draw_identification_figures
 from twin.discovery.parameters import GAP_PREFIX
 from twin.discovery.result import Interval, Verdict
-from twin.discovery.screening import MIN_STEP_UNITS
 from twin.discovery.task import DiscoveredModel, FittedModel
+from twin.discovery.units import MIN_STEP_UNITS
 from twin.discovery.words import (
     CHANNEL_KINDS,
     KIND_LABELS,
@@ -93,7 +93,6 @@ def list_parameter_rows(
 ) -> list[tuple[str, str, list[str], str]]:
     """Return (group, parameter, [value, low, high], unit) of all fitted values, lengths in mm."""
     law = verdict.law
-    term = None if law else verdict.remainder.evidence
     groups = [
         (format_effect(effect), effect.parameters)
         for effect in verdict.effects
@@ -101,7 +100,6 @@ def list_parameter_rows(
     ]
     if law is not None:
         groups += [(f"proposed law, {part.title}", part.parameters) for part in law.terms]
-    groups += [(f"generic term, {term.term}", term.parameters)] if term else []
     fitted_base = law.base if law else verdict.base
     base = {_gap_label(name, names): value for name, value in fitted_base.items()}
     rows = []

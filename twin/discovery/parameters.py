@@ -1,7 +1,7 @@
 """Parameter set: model parameters, assumed sensor errors, and gap and tare corrections per log.
 
-Each parameter has a key: `BaseKey`, `EffectKey`, `TermKey`, `SlipKey`, `GapKey`, `TareKey` or
-`NuisanceKey`. The text of a key is the name of the parameter in files and messages.
+Each parameter has a key: `BaseKey`, `EffectKey`, `SlipKey`, `GapKey`, `TareKey` or `NuisanceKey`.
+The text of a key is the name of the parameter in files and messages.
 """
 
 import math
@@ -19,7 +19,6 @@ from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model, SensorModel
 from twin.model.parameters import Parameters
 
-GENERIC_PREFIX = "general"  # of the names of generic terms
 # of the names of the corrections per log
 GAP_PREFIX, TARE_PREFIX, NUISANCE_PREFIX = "gap", "zero", "nuisance"
 MAX_TARE_SIGMA = 4.0  # bound on a tare error in standard deviations; more is a sensor offset
@@ -52,17 +51,6 @@ class EffectKey:
 
     def __str__(self) -> str:
         return ".".join(filter(None, (self.effect, self.channel, self.name)))
-
-
-@dataclass(frozen=True, slots=True)
-class TermKey:
-    """Parameter of a generic term; used in fits, not part of a model."""
-
-    term: str
-    name: str
-
-    def __str__(self) -> str:
-        return f"{GENERIC_PREFIX}.{self.term}.{self.name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +94,7 @@ class NuisanceKey:
         return ".".join(filter(None, (f"{NUISANCE_PREFIX}{self.log}", self.kind, self.place)))
 
 
-ParameterKey = BaseKey | EffectKey | TermKey | SlipKey | GapKey | TareKey | NuisanceKey
+ParameterKey = BaseKey | EffectKey | SlipKey | GapKey | TareKey | NuisanceKey
 
 STIFFNESS, DAMPING = BaseKey("stiffness"), BaseKey("damping")
 BUMPER_STIFFNESS, BUMPER_DAMPING = BaseKey("bumper_stiffness"), BaseKey("bumper_damping")

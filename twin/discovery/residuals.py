@@ -25,14 +25,13 @@ from scipy.ndimage import binary_opening
 from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.facts import BlockBasis
-from twin.discovery.generic_terms import compute_generic_forces, compute_resonator_force
 from twin.discovery.motion import (
     ConsistencyResidual,
     MeasuredMotion,
     RecordScale,
     measure_scale,
 )
-from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet, TermKey
+from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet
 from twin.discovery.signals import LogSignals, derives_acc
 from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
@@ -543,13 +542,6 @@ class LogResiduals:
         if added is not None:
             d = d + model.parameters.mass * added
         left = -left
-        if any(isinstance(key, TermKey) for key in parameters.values):
-            p = model.parameters
-            generic = compute_generic_forces(
-                parameters.values, m, (p.gap_r, p.gap_l), sampled.contact, self.scale,
-                lambda hz: compute_resonator_force(sampled.whole, hz)[sampled.samples],
-            )  # fmt: skip
-            d, right, left = d + generic[0], right + generic[1], left + generic[2]
         measured = self._measured_forces(m, model.parameters.mass, parameters)
         return measured[0] - d, measured[1] - right, measured[2] - left
 

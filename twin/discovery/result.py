@@ -108,20 +108,10 @@ class ExcludedSet(Contract):
     sigma: Misfit = Field(description="standard errors by which it is worse")
 
 
-class GenericTerm(Contract):
-    """Generic term that fits better than every library effect."""
-
-    term: str = Field(description="its formula")
-    meaning: str = Field(description="scales of the symbols")
-    held_out_error: Misfit = Field(description="rms cross-validation residual over the noise")
-    parameters: dict[str, Interval] = Field(description="fitted parameters")
-
-
 class Remainder(Contract):
     """Part of the misfit that remains."""
 
     unexplained: bool = Field(description="whether it exceeds an inexact force law")
-    evidence: GenericTerm | None = Field(description="null without a better generic term")
 
 
 class ExplanationResult(Contract):

@@ -8,32 +8,22 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import takewhile
 
 import numpy as np
 
 from table_io.block import Float1D, Int1D
-from twin.discovery.candidates import Candidate, list_generic_candidates
+from twin.discovery.candidates import Candidate
 from twin.discovery.evidence import Hypothesis, LinearEvidence, build_evidence, softmax
 from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
-from twin.discovery.residuals import LogResiduals, measure_level
-from twin.discovery.screening import (
-    NormalEquations,
-    ScreenedCandidate,
-    assign_folds,
-    build_normal_equations,
-    rank_candidates,
-)
+from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
+from twin.discovery.units import assign_folds
 
 MAX_EFFECTS = 3
 MAX_EXPLAINED_COST = 1.1  # mean square over the noise: with less, nothing is left to explain
 MAX_ROUNDS = 3  # of rankings, each about the best fit of the one before
 REFIT_NATS, MAX_REFITS = 5.0, 4  # below the best log evidence; sets refitted in a round
-MAX_GENERIC_REFITS = 2
 MIN_PROBABILITY = 1e-3  # of an explanation that is reported
-MIN_REFITS, MAX_COST_RATIO = 2, 1.5  # beyond the first two, skip costs above this ratio to the best
-MIN_PROMISED_GAIN = 0.003  # of the residual squares: candidates that promise less are not refitted
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
@@ -172,6 +162,10 @@ class SelectionProblem:
         ]
         return measure_level(self.log_residuals, noise, forces_only=True)
 
+    def leaves_noise(self, fitted: FittedSet) -> bool:
+        """Return True if what a set leaves of the forces is noise, its own included."""
+        return self.measure_level(fitted) <= MAX_LEVEL * max(1.0, self.measure_noise(fitted))
+
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""
         rows: dict[str, list[Float1D]] = {}
@@ -236,6 +230,23 @@ class SelectionResult:
     evidence: LinearEvidence | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class RoundEffort:
+    """How far a round of a search goes: sets of so many effects, and which of them are refitted.
+
+    Those within so many nats of the most probable, and no more than `max_refits`. With a `share`
+    within that of its log evidence, and without a stranger: where shapes are free, as those of laws
+    are, a ladder of them promises little. With `if_open` a round is left out where a set of those
+    before leaves noise alone.
+    """
+
+    stage: str = "the most probable sets"
+    max_effects: int = MAX_EFFECTS
+    max_refits: int = MAX_REFITS
+    share: float = 0.0
+    if_open: bool = False
+
+
 class Cancelled(Exception):
     """Exception for a progress callback to stop the selection and keep the best set so far."""
 
@@ -245,7 +256,7 @@ def select_effects(
     start: ParameterSet,
     report: ProgressCallback = lambda progress: None,
     first: FittedSet | None = None,
-    rounds: int = MAX_ROUNDS,
+    rounds: Sequence[RoundEffort] = (RoundEffort(),) * MAX_ROUNDS,
 ) -> SelectionResult:
     """Select the most probable set of effects; see `evidence`.
 
@@ -259,9 +270,12 @@ def select_effects(
         state = replace(state, best=problem.fit_effects(first.add_to(start), first.effects))
         refitted[frozenset(first.names)] = state.best
     try:
-        for _ in range(rounds):
+        for effort in rounds:
             before = state.best
-            state = _advance(problem, state, refitted, report)
+            closest = min(refitted.values(), key=lambda fitted: fitted.cost)
+            if effort.if_open and problem.leaves_noise(closest):
+                break
+            state = _advance(problem, state, refitted, report, effort)
             if {*state.best.names} == {*before.names}:
                 break
         return state
@@ -276,6 +290,7 @@ def _advance(
     state: SelectionResult,
     refitted: dict[frozenset[str], FittedSet],
     report: ProgressCallback,
+    effort: RoundEffort,
 ) -> SelectionResult:
     """Rank all sets about the base of the best fit so far, and refit the most probable ones."""
     current = state.best
@@ -290,15 +305,15 @@ def _advance(
     linear = build_evidence(
         problem.log_residuals, base, problem.library, known_shapes, rich, problem.mapper
     )
-    promised = linear.rank_states(MAX_EFFECTS)
-    for index in range(1, MAX_REFITS + 1):
+    promised = linear.rank_states(effort.max_effects)
+    for index in range(1, effort.max_refits + 1):
         states = _correct_by_refits(linear, promised, refitted, state.null)
-        each = _find_open(linear, states, refitted)
+        each = _find_open(linear, states, refitted, effort.share)
         if each is None:
             break
         variants = [linear.variants[c] for c in each.columns]
         names = tuple(variant.candidate.name for variant in variants)
-        report(SelectionProgress("the most probable sets", names, index, MAX_REFITS, current))
+        report(SelectionProgress(effort.stage, names, index, effort.max_refits, current))
         parameters = base
         for variant, amplitude in zip(variants, linear.estimate(each.columns)[0], strict=True):
             parameters = variant.add_to(parameters, float(amplitude))
@@ -319,16 +334,21 @@ def _find_open(
     linear: LinearEvidence,
     states: Sequence[Hypothesis],
     refitted: Mapping[frozenset[str], FittedSet],
+    share: float,
 ) -> Hypothesis | None:
     """Return the most probable state whose set has not been refitted; None if all near ones have.
 
     More effects that are less probable only add noise to what the best says.
     """
+    best = states[0]
+    least = best.log_evidence - max(REFIT_NATS, share * abs(best.log_evidence))
     for each in states:
         names = linear.names(each)
-        if each.log_evidence < states[0].log_evidence - REFIT_NATS:
+        if each.log_evidence < least:
             break
-        if names not in refitted and not linear.names(states[0]) < names:
+        if share and each.place:
+            continue
+        if names not in refitted and not linear.names(best) < names:
             return each
     return None
 
@@ -361,38 +381,3 @@ def _correct_by_refits(
         return replace(state, log_evidence=state.log_evidence - own)
 
     return sorted(map(correct, states), key=lambda state: -state.log_evidence)
-
-
-def fit_without(problem: SelectionProblem, fitted: FittedSet, dropped: Candidate) -> FittedSet:
-    """Return a set refitted without one of its effects."""
-    kept = tuple(effect for effect in fitted.effects if effect is not dropped)
-    return problem.fit_effects(dropped.remove_from(fitted.fit.parameters), kept)
-
-
-def fit_generic_terms(problem: SelectionProblem, start: FittedSet) -> tuple[FittedSet, ...]:
-    """Return a set with each of the best generic terms added."""
-    library = list_generic_candidates(problem.log_residuals)
-    parameters = start.fit.parameters
-    equations = build_normal_equations(problem.log_residuals, parameters, library, problem.mapper)
-    return tuple(
-        problem.fit_effects(screened.add_to(parameters), (*start.effects, screened.candidate))
-        for screened in select_promising(equations, MAX_GENERIC_REFITS)
-    )
-
-
-def select_promising(
-    equations: NormalEquations, max_count: int, reached: float = math.inf
-) -> list[ScreenedCandidate]:
-    """Return the best candidates, without those with little gain or far worse than the first.
-
-    Or than what has been `reached` without them, over the mean square before.
-    """
-    ranked = rank_candidates(equations, max_count)
-
-    def is_promising(indexed: tuple[int, ScreenedCandidate]) -> bool:
-        index, screened = indexed
-        hopeless = index >= MIN_REFITS and screened.cost > MAX_COST_RATIO * ranked[0].cost
-        hopeless = hopeless or screened.cost > MAX_COST_RATIO * reached * equations.base_cost
-        return not hopeless and screened.cost <= (1.0 - MIN_PROMISED_GAIN) * equations.base_cost
-
-    return [screened for _, screened in takewhile(is_promising, enumerate(ranked))]

@@ -21,14 +21,12 @@ from twin.discovery.parameters import (
     ParameterKey,
     is_correction,
 )
-from twin.discovery.residuals import MAX_LEVEL
 from twin.discovery.selection import (
     MIN_VISIBLE_EXCESS,
     Explanation,
     FittedSet,
     SelectionProblem,
     SelectionResult,
-    fit_generic_terms,
 )
 from twin.laws.library import EFFECTS, load_plugins
 
@@ -45,7 +43,6 @@ class DiscoveryVerdict:
     confidence: float  # probability of the verdict
     effects_confidence: float  # probability that the effects are all that the model lacks
     alternatives: tuple[FittedSet, ...]  # about as probable as the best, if ambiguous
-    generic: FittedSet | None  # set with a generic term that shows the form of what remains
     floor: float
     has_remainder: bool  # a stranger is probable beside the effects, or more than noise remains
     reason: str
@@ -70,14 +67,8 @@ def judge_selection(
     by_set = sum_by_set(selection.explanations)
     probability = by_set.get(frozenset(best.names), 0.0)
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
-    noise = max(1.0, problem.measure_noise(best))
-    remains = problem.measure_level(best) > MAX_LEVEL * noise
+    remains = not problem.leaves_noise(best)
     has_remainder = beside > 0.5 or remains
-    generic = None
-    if has_remainder:
-        generic = min(
-            fit_generic_terms(problem, best), key=lambda fitted: fitted.cost, default=None
-        )
 
     def conclude(
         outcome: str, fitted: FittedSet, probability: float, reason: str,
@@ -85,8 +76,8 @@ def judge_selection(
     ) -> DiscoveryVerdict:  # fmt: skip
         of_effects = probability if effects_confidence is None else effects_confidence
         return DiscoveryVerdict(
-            outcome, fitted, probability, of_effects, alternatives, generic, floor, has_remainder,
-            reason, place=place if has_remainder else "",
+            outcome, fitted, probability, of_effects, alternatives, floor, has_remainder, reason,
+            place=place if has_remainder else "",
         )  # fmt: skip
 
     where = f" in the {place}" if beside > 0.5 else ""
@@ -105,7 +96,7 @@ def judge_selection(
         return conclude(
             "unexplained", best, unknown, reason, effects_confidence=0.0 if remains else alone
         )
-    limits = {c.name: c.effect.limits for c in problem.library if c.effect is not None}
+    limits = {c.name: c.effect.limits for c in problem.library}
     none = by_set.get(frozenset(), 0.0)
     containing = [p for names, p in by_set.items() if _holds_effects(names, best, limits)]
     probability = sum(containing)
@@ -172,7 +163,7 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     it is visible; what is too little to be seen is stated, but widens nothing.
     """
     best = verdict.best
-    laws = [each.effect for each in best.effects if each.effect and each.effect.acts in FORCE_LAWS]
+    laws = [each.effect for each in best.effects if each.effect.acts in FORCE_LAWS]
     is_bumper = {law.is_in_bumpers for law in laws}
     if verdict.outcome != "named" or not is_bumper:
         return verdict
@@ -194,21 +185,21 @@ def widen_for_form(verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     return replace(verdict, best=widened, form_errors=form_errors)
 
 
-def qualify_none(problem: SelectionProblem, verdict: DiscoveryVerdict) -> DiscoveryVerdict:
+def qualify_none(selection: SelectionResult, verdict: DiscoveryVerdict) -> DiscoveryVerdict:
     """Return a verdict "none" with the force laws to which the recordings are blind, if any.
 
     They do not exclude these, so its confidence is at most that of a guess.
     """
     if verdict.outcome != "none":
         return verdict
-    blind = find_blind_spots(problem, verdict.best)
+    blind = find_blind_spots(selection.evidence, verdict.best)
     if not blind:
         return verdict
     names = ", ".join(effect.candidate.name for effect in blind)
     reason = (
         f"{verdict.reason}, but the recordings cannot show {names}: other parameters imitate "
         f"{'them' if len(blind) > 1 else 'it'}, even as large as {100 * MAX_HIDDEN_SHARE:.0f} % of "
-        "the spring of the damper"
+        "the measured force"
     )
     return replace(verdict, reason=reason, blind_to=blind)
 

@@ -107,11 +107,8 @@ def format_verdict(verdict: Verdict) -> str:
     if verdict.law:
         titles = " and ".join(term.title for term in verdict.law.terms)
         return f"{text} A law was found for it: {titles}."
-    if verdict.verdict == "unexplained":
-        if term := verdict.remainder.evidence:
-            text += f" A general law would fit: {term.term}."
-        if names:
-            text += f" The closest is {names}, but it is not sufficient."
+    if verdict.verdict == "unexplained" and names:
+        text += f" The closest is {names}, but it is not sufficient."
     return text
 
 

@@ -4,20 +4,15 @@ A row is a force at a place with an amplitude and shapes, relative to the record
 are its largest displacement, velocity, depth in a bumper and table displacement, w0 is the largest
 displacement, t0 the duration. So a search does not depend on the size of the specimen.
 
-Rows of `FAMILIES` become effects of effect files, and laws of a model. Those of `GENERIC_TERMS`
-never enter a model: that one of them explains a measurement much better than every effect of the
-library shows that the missing effect is not in the library.
+Rows become effects of effect files, and laws of a model.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
-from typing import Any
 
 import numpy as np
 
 from twin.laws.effect import Place, State
-from twin.laws.expression import Expression, parse_expression
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,8 +21,7 @@ class ForceTerm:
 
     `shapes` gives a ladder by name; a shape in m, m/s or s is relative to the record's largest
     displacement (depth in a bumper), velocity or the duration. `power` is (variable, is odd) of a
-    power law; `amplitude` the name and unit of the parameter with which the law vanishes. A row
-    that `is_generic` has no class: it shows that a law is missing, and is none.
+    power law; `amplitude` the name and unit of the parameter with which the law vanishes.
     """
 
     name: str
@@ -39,20 +33,6 @@ class ForceTerm:
     states: Mapping[str, State] = field(default_factory=dict)
     title: str = ""
     amplitude: tuple[str, str] = ("k", "N")
-
-    @property
-    def is_generic(self) -> bool:
-        """Return whether the row never enters a model."""
-        return self.law_class == GENERIC
-
-    def evaluate(self, values: Mapping[str, Any]) -> Any:
-        """Return the shape of a generic row for numbers or arrays of the names in it."""
-        return _parse_shape(self.force).evaluate(values)
-
-
-@cache
-def _parse_shape(text: str) -> Expression:
-    return parse_expression(text, ("u", "v", "d", "u0", "v0", "d0", "w"))
 
 
 REFERENCE_UNITS = {"u0": "m", "v0": "m/s", "d0": "m", "y0": "m", "t0": "s"}
@@ -74,13 +54,9 @@ CONTACT_TIMES = (1e-4, *RELAXATIONS)
 RESONANCES = tuple(float(ratio) ** 2 for ratio in np.geomspace(0.3, 12.0, 34))
 RESONANCE_DECAYS = (0.15,)  # 2 z omega over the main angular frequency
 CUBIC_RESONANCES = tuple(float(ratio) for ratio in np.geomspace(0.1, 1e3, 44))
-GENERIC_WIDTHS = (0.03, 0.06, 0.12, 0.25, 0.5)
-GENERIC_RESONANCES_HZ = (0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)
 MEMORYLESS, CONTACT, TABLE = "force in u and v", "bumper force", "force on the table's motion"
 MEMORY, DRIFT, RESONATOR = "internal state", "drift in time", "attached resonator"
 EXPRESSION = "free expression"  # of symbolic regression
-GENERIC = "generic"
-RESONATOR_TERM = "damper resonator"
 HYSTERESIS = {"z": State("", "(v - abs(v) * z * abs(z)**(n - 1)) / w")}
 TOUCH = "min(max(100 * d / d0, 0), 1)"  # 1 in contact, 0 where a face is free: it relaxes to d = 0
 
@@ -112,12 +88,7 @@ def _drifts(
     )  # fmt: skip
 
 
-def _generic(name: str, force: str, widths: Sequence[float] = ()) -> ForceTerm:
-    place: Place = "damper" if name.startswith("damper") else "bumpers"
-    return ForceTerm(name, GENERIC, place, force, {"w": widths} if widths else {})
-
-
-TERMS: tuple[ForceTerm, ...] = (
+FAMILIES: tuple[ForceTerm, ...] = (
     ForceTerm("spring_power", MEMORYLESS, "damper", f"k * {write_power('u', 'u0', True)}",
                {"p": ODD_EXPONENTS}, ("u", True), title="nonlinear spring"),
     ForceTerm("constant_force", MEMORYLESS, "damper", "k", {},
@@ -216,32 +187,4 @@ TERMS: tuple[ForceTerm, ...] = (
     *_drifts("damper", "damping", "v / v0", {}, "damping"),
     *_drifts("damper", "friction", "tanh(v / s)", {"s": (0.006, 0.03)}, "friction"),
     *_drifts("bumpers", "bumper", "d / d0", {}, "bumper stiffness"),
-    # Shapes of size 1 at the largest u, v or d, with one width w relative to those.
-    _generic("damper u|u|", "u / u0 * abs(u / u0)"),
-    _generic("damper u^2", "(u / u0)**2"),
-    _generic("damper u^5", "(u / u0)**5"),
-    _generic("damper u^9", "(u / u0)**9"),
-    _generic("damper v^2", "(v / v0)**2"),
-    _generic("damper v^3", "(v / v0)**3"),
-    _generic("damper v^5", "(v / v0)**5"),
-    _generic("damper u v", "u / u0 * (v / v0)"),
-    _generic("damper |u| v", "abs(u / u0) * (v / v0)"),
-    _generic("damper u^2 v", "(u / u0)**2 * (v / v0)"),
-    _generic("damper u v^2", "u / u0 * (v / v0)**2"),
-    _generic("damper |u| sign(v)", "abs(u / u0) * sign(v)"),
-    _generic("damper tanh(u/w)", "tanh(u / u0 / w)", GENERIC_WIDTHS),
-    _generic("damper sign(v) exp(-(v/w)^2)", "sign(v) * exp(-(v / v0 / w)**2)", GENERIC_WIDTHS),
-    _generic(RESONATOR_TERM, "", GENERIC_RESONANCES_HZ),  # filtered, from the acceleration
-    _generic("bumper d^3", "(d / d0)**3"),
-    _generic("bumper d^5", "(d / d0)**5"),
-    _generic("bumper sqrt(d)", "sqrt(d / d0)"),
-    _generic("bumper d^2 d'", "(d / d0)**2 * (v / v0)"),
-    _generic("bumper d'|d'|", "v / v0 * abs(v / v0)"),
-    _generic("bumper d'^3", "(v / v0)**3"),
-    _generic("bumper sign(d')", "sign(v)"),
-    _generic("bumper d sign(d')", "d / d0 * sign(v)"),
 )  # fmt: skip
-
-
-FAMILIES = tuple(term for term in TERMS if not term.is_generic)
-GENERIC_TERMS = {term.name: term for term in TERMS if term.is_generic}

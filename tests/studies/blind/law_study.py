@@ -163,7 +163,7 @@ def find_law_of_base(
     """Return (problem, its base, law) without a search of the library before."""
     problem = prepared.problem
     null = problem.fit_effects(prepared.parameters, ())
-    return problem, null, select_law(problem, [null], search_laws(problem, [null]))
+    return problem, null, select_law(problem, null, search_laws(problem, null, null))
 
 
 def _describe_terms(law: LawProposal | None) -> list[Json]:

@@ -42,7 +42,7 @@ from twin.discovery.motion import MeasuredMotion
 from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import FORCE_ROWS, LogResiduals
-from twin.discovery.screening import FOLD_COUNT, assign_folds
+from twin.discovery.units import FOLD_COUNT, assign_folds
 from twin.model.model import Model
 from twin.setup.run_config import read_model_template
 
