@@ -7,7 +7,7 @@ imported when a rig file names it, not before.
 """
 
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, cached_property
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from pydantic import (
@@ -399,7 +399,7 @@ class RigConfig(ConfigModel):
         """True if the tare of a run is that of clear bumpers, whatever the gap."""
         return any(section.tares_without_bumpers for section in self.sections.values())
 
-    @property
+    @cached_property
     def channels(self) -> tuple[str, ...]:
         """Names of the acquired channels, in the order of the sensors."""
         return tuple(sensor.channel for sensor in self.sensors)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Float2D
 from table_io.records import FrequencyResponse
 
 HARMONIC_COUNT = 10
@@ -48,7 +48,7 @@ def track_harmonics(
     Harmonics with fewer than four samples per cycle are not fitted (zero). All NaN if samples are
     lost or too few.
     """
-    return _fit_harmonics(_harmonic_basis(phase, harmonics), values, harmonics)
+    return track_channels(values[None], phase, harmonics)[0]
 
 
 def track_channels(
@@ -56,7 +56,8 @@ def track_channels(
 ) -> list[HarmonicFit]:
     """Apply `track_harmonics` to several channels, (channel, sample), with one phase."""
     basis = _harmonic_basis(phase, harmonics)
-    return [_fit_harmonics(basis, row, harmonics) for row in values]
+    normal = _normal_matrix(basis)
+    return [_fit_harmonics(basis, normal, row, harmonics) for row in values]
 
 
 def _harmonic_basis(phase: Float1D, harmonics: int) -> Float1D:
@@ -73,13 +74,16 @@ def _harmonic_basis(phase: Float1D, harmonics: int) -> Float1D:
     return basis
 
 
-def _fit_harmonics(basis: Float1D, values: Float1D, harmonics: int) -> HarmonicFit:
+def _normal_matrix(basis: Float2D) -> Float2D:
+    # Not BLAS: on a busy computer its threads can wait seconds for one another.
+    return np.asarray(np.einsum("ij,ik->jk", basis, basis))
+
+
+def _fit_harmonics(basis: Float2D, normal: Float2D, values: Float1D, harmonics: int) -> HarmonicFit:
     columns = basis.shape[1]
     if columns < 3 or values.size < 2 * columns or not np.isfinite(values).all():
         return NO_FIT
-    # Not BLAS: on a busy computer its threads can wait seconds for one another.
-    normal, rhs = np.einsum("ij,ik->jk", basis, basis), np.einsum("ij,i->j", basis, values)
-    solution = np.linalg.solve(normal, rhs)
+    solution = np.linalg.solve(normal, np.einsum("ij,i->j", basis, values))
     amplitudes = np.zeros(harmonics, dtype=np.complex128)
     # a sin + b cos = Im((a + i b) exp(i theta))
     amplitudes[: columns // 2] = solution[1::2] + 1j * solution[2::2]
