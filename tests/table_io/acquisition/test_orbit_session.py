@@ -21,6 +21,7 @@ from table_io.records import Event, OrbitPoint, RunStop
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer import orbits, procedure, releases
 from table_io.sim.plant import Plant
+from tests.builders.profiles import make_history_profile
 from tests.builders.rigs import RIG
 from tests.builders.sessions import PlayedSession, play_session
 from tests.input_errors import raises_input_error
@@ -49,19 +50,12 @@ def make_profile(
     orbits = PLAN["points"][points] if planned is None else [planned]
     plan = PLAN | {"points": orbits, "latency_s": latency_s}
     excitation = {
-        "kind": "continuation",
         "start_hz": 2.85,
         "stop_hz": 3.0,
         "file": "orbits.json",
         "files": {"orbits.json": json.dumps(plan)},
     }
-    return Profile.model_validate(
-        {
-            "title": "two unstable orbits",
-            "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-            "excitation": excitation | keys,
-        }
-    )
+    return make_history_profile("continuation", **excitation | keys)
 
 
 @pytest.fixture(scope="module")

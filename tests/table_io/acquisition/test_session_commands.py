@@ -29,6 +29,7 @@ from table_io.excitation.trajectory import plan_sweep
 from table_io.records import Event, Record, RunStop, SampleGap, Trip
 from table_io.sequencer import procedure
 from tests.builders.drives import sine_segments
+from tests.builders.rigs import change_rig
 from tests.builders.sessions import make_start
 from tests.table_io.acquisition.test_session import (
     RATE_HZ,
@@ -341,13 +342,8 @@ def test_samples_from_999_thousandths_of_the_range_on_are_clipped(is_reversed: b
     shown = {101: 0.998, 105: 0.999, 110: 1.0, 115: -0.998, 120: -0.999, 125: -1.2}
     channel = "force_l2_n" if is_reversed else ""
     subject = Taring(plan_sweep(profile()), ManualClock(), reversed_channel=channel, shown=shown)
-    sensors = tuple(
-        sensor.model_copy(update={"volts_per_unit": -sensor.volts_per_unit})
-        if sensor.channel == channel
-        else sensor
-        for sensor in RIG.sensors
-    )
-    setup = SessionSetup(profile(), RIG.model_copy(update={"sensors": sensors}))
+    slope = RIG.sensors[RIG.channels.index("force_l2_n")].volts_per_unit
+    setup = SessionSetup(profile(), change_rig(sensors={channel: {"volts_per_unit": -slope}}))
     items = list(run_session(setup, subject, subject.clock, make_start, Stop(10)))
     gaps = [item for item in items if isinstance(item, SampleGap)]
     assert gaps == [
@@ -407,8 +403,7 @@ def test_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
 
 @pytest.mark.parametrize("due", ["2020-01-01", "9999-01-01"])
 def test_overdue_calibrations_are_events_before_the_first_block(due: str) -> None:
-    dated = tuple(sensor.model_copy(update={"due": due}) for sensor in RIG.sensors)
-    rig = RIG.model_copy(update={"sensors": dated})
+    rig = change_rig(every_sensor={"due": due})
     subject = machine()
     items = list(
         run_session(SessionSetup(profile(), rig), subject, subject.clock, make_start, Stop(2))

@@ -29,6 +29,7 @@ from table_io.errors import InputError
 from table_io.sim.machine import server
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
+from tests.builders.drives import make_bump
 from tests.builders.flight_records import read_flight_record
 from tests.input_errors import raises_input_error
 from tests.table_io.sim.test_machine import RATE_HZ, RIG, SPECIMEN, claim
@@ -84,8 +85,7 @@ def driving(where: str) -> MachineBackend:
     """A controller whose table moves for a little, to rest."""
     backend = controller(where)
     backend.open()
-    x = np.clip(np.arange(600) / 598, 0.0, 1.0)
-    backend.queue(0, 0.1 * 64 * (x * (1 - x)) ** 3)
+    backend.queue(0, make_bump(0.1, 600))
     backend.start()
     backend.read(20)
     return backend

@@ -17,35 +17,18 @@ from table_io.backends.ni.config import NiFault
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock, RealClock
 from table_io.config.base import parse_toml
-from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
 from table_io.sim.ni.device import DriverError, ErrorCode, SimulatedDaqDevice, Task
 from table_io.sim.ni.server import ServerEndpoint
 from tests.builders.flight_records import read_flight_record
+from tests.builders.profiles import make_profile
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.sessions import make_start
 from tests.input_errors import raises_input_error
 from tests.studies.ni_error_codes import CALLS, RATE_HZ, judge_ending, meet_fault, motion
 from tests.table_io.backends.ni_wire import CARD, SPECIMEN, Answer, Bed, get_wiring, note_heartbeats
-
-SHORT = """
-title = "short"
-rig = "ni_simulated"
-model = "snm"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.0
-stop_hz = 2.4
-step_hz = 0.4
-cycles = 4
-directions = ["forward"]
-[loop_check]
-enabled = false
-"""
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +46,8 @@ def start_backend(bed: Bed) -> NiBackend:
 
 
 def session(bed: Bed) -> list[Any]:
-    profile = parse_toml(SHORT, Profile, "short")
+    grid = {"start_hz": 2.0, "stop_hz": 2.4, "step_hz": 0.4, "directions": ["forward"]}
+    profile = make_profile(tables={"loop_check": {"enabled": False}}, **grid)
     setup = SessionSetup(profile, bed.rig)
     return list(run_session(setup, bed.backend(), bed.clock, make_start, lambda: None))
 

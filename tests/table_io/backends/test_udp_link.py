@@ -40,6 +40,7 @@ from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SimulatedMachine
 from table_io.sim.udp.server import UdpTarget, bind_socket, serve_udp_target
+from tests.builders.drives import make_bump
 from tests.input_errors import raises_input_error
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
@@ -98,8 +99,7 @@ def driving(address: Address, samples: int = 600) -> UdpBackend:
     """A rig whose table moves for a little, to rest."""
     backend = rig_side(address)
     backend.open()
-    x = np.clip(np.arange(samples) / (samples - 2), 0.0, 1.0)
-    backend.queue(0, 6.4 * (x * (1 - x)) ** 3)
+    backend.queue(0, make_bump(0.1, samples))
     backend.start()
     backend.read(20)
     return backend

@@ -24,6 +24,7 @@ from table_io.excitation.drive import MAX_STOP_RATIO, Drive
 from table_io.excitation.trajectory import plan_excitation
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
+from tests.builders.profiles import make_history_profile
 from tests.builders.rigs import RIG
 from tests.input_errors import raises_input_error
 from tests.table_io.excitation.pulse_train import PulseTrain
@@ -62,13 +63,7 @@ every_kind = pytest.mark.parametrize("kind", sorted(EXCITATIONS))
 
 
 def profile(kind: str, **excitation: Any) -> Profile:
-    return Profile.model_validate(
-        {
-            "title": kind,
-            "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-            "excitation": {**EXAMPLES[kind], "kind": kind, **excitation},
-        }
-    )
+    return make_history_profile(**{**EXAMPLES[kind], "kind": kind, **excitation})
 
 
 @cache

@@ -16,7 +16,7 @@ from table_io.safety.wiring_check import (
     is_disturbed,
     list_stimuli,
 )
-from tests.builders.rigs import RIG
+from tests.builders.rigs import RIG, change_rig
 
 RATE, SAMPLES, BEFORE, AT = 2000.0, 3000, 800, 1500
 NOISE = np.array([sensor.noise_rms for sensor in RIG.sensors])
@@ -189,8 +189,7 @@ def test_swing_at_rest_is_not_the_first_swing() -> None:
 
 
 def with_shunt(size: float) -> RigConfig:
-    cell = RIG.sensors[-1].model_copy(update={"shunt": size, "shunt_tolerance": 0.02})
-    return RIG.model_copy(update={"sensors": (*RIG.sensors[:-1], cell)})
+    return change_rig(sensors={"force_l2_n": {"shunt": size, "shunt_tolerance": 0.02}})
 
 
 @pytest.mark.parametrize(
@@ -230,10 +229,7 @@ def test_swing_stands_out_of_noise_converter_and_range(
     channel: str, noise: float, lsb_share: float, expected: float
 ) -> None:
     """All in shares of the range; the smallest swing is ten times the largest of the three."""
-    row = RIG.channels.index(channel)
     bits = round(np.log2(2.0 / lsb_share))
-    sensor = RIG.sensors[row].model_copy(update={"range": 40.0, "bits": bits})
-    sensors = (*RIG.sensors[:row], sensor, *RIG.sensors[row + 1 :])
-    rig = RIG.model_copy(update={"sensors": sensors})
-    response = replace(make_response({}, rig), noise_rms=np.full(len(sensors), noise * 40.0))
+    rig = change_rig(sensors={channel: {"range": 40.0, "bits": bits}})
+    response = replace(make_response({}, rig), noise_rms=np.full(len(rig.sensors), noise * 40.0))
     assert response.min_swing(channel) == pytest.approx(10.0 * expected * 40.0, rel=0.05)

@@ -14,7 +14,7 @@ from table_io.safety.wiring_check import (
     check_zero_command,
     fit_mains_hum,
 )
-from tests.builders.rigs import RIG
+from tests.builders.rigs import RIG, change_rig
 
 RATE, SAMPLES = 2000.0, 8000
 ACC = RIG.channels.index("table_acc_m_s2")
@@ -94,13 +94,9 @@ def test_stuck_channel_from_the_first_sample_or_later() -> None:
 
 
 def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
-    sensors = tuple(
-        sensor.model_copy(update={"bits": 12, "noise_rms": 0.005})
-        if sensor.unit == "mm"
-        else sensor
-        for sensor in RIG.sensors
-    )
-    rig = RIG.model_copy(update={"sensors": sensors})
+    coarse = {"bits": 12, "noise_rms": 0.005}
+    lasers = [sensor.channel for sensor in RIG.sensors if sensor.unit == "mm"]
+    rig = change_rig(sensors=dict.fromkeys(lasers, coarse))
     values = spoilt(LASER, 0.1)
     (line,) = (
         line
@@ -129,8 +125,7 @@ def test_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
 
 
 def test_unknown_noise_is_not_tested_and_measured() -> None:
-    sensors = tuple(sensor.model_copy(update={"noise_rms": 0.0}) for sensor in RIG.sensors)
-    rig = RIG.model_copy(update={"sensors": sensors})
+    rig = change_rig(every_sensor={"noise_rms": 0.0})
     results = [line for line in lines(still(), rig=rig) if line.name == "noise"]
     assert {line.verdict for line in results} == {"not tested"}
     (laser,) = (line.do for line in results if line.channel == "table_disp_m")
@@ -197,11 +192,7 @@ def test_offset_drift_and_spike() -> None:
 
 def test_offset_of_the_card_is_where_the_range_begins() -> None:
     """A laser that stands 40 mm off is right where its card says so."""
-    sensors = tuple(
-        sensor.model_copy(update={"offset": 40.0}) if sensor.channel == "table_disp_m" else sensor
-        for sensor in RIG.sensors
-    )
-    rig = RIG.model_copy(update={"sensors": sensors})
+    rig = change_rig(sensors={"table_disp_m": {"offset": 40.0}})
     values = still()
     assert [line.channel for line in lines(values, rig=rig) if line.verdict == "fail"] == [
         "table_disp_m"
@@ -212,13 +203,11 @@ def test_offset_of_the_card_is_where_the_range_begins() -> None:
 
 def test_bits_that_noise_leaves() -> None:
     resting = RestingInputs(RIG, RATE, still() * GAIN)
-    laser = RIG.sensors[LASER]
     assert resting.effective_bits(LASER) == pytest.approx(
         np.log2(150.0 / (np.sqrt(12) * 0.005)), abs=0.05
     )
     assert resting.effective_bits(0) == RIG.sensors[0].bits  # nothing but the converter's own steps
-    loud = laser.model_copy(update={"noise_rms": 1.0})
-    rig = RIG.model_copy(update={"sensors": (RIG.sensors[0], loud, *RIG.sensors[2:])})
+    rig = change_rig(sensors={"table_disp_m": {"noise_rms": 1.0}})
     values = spoilt(LASER, np.random.default_rng(5).standard_normal(SAMPLES))
     failed = [line for line in lines(values, rig=rig) if line.verdict == "fail"]
     assert [(line.name, line.channel) for line in failed] == [("bits used", "table_disp_m")]

@@ -9,31 +9,18 @@ import pytest
 from table_io.block import Block
 from table_io.clock import ManualClock
 from table_io.config.calibration import command_to_volts, compute_tare, volts_to_si
-from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.safety.sample_checks import compute_thresholds
 from table_io.safety.wiring_check import RestingInputs, check_resting_inputs, list_stimuli
 from table_io.sim.simulated_table import SimulatedBackend
-from tests.builders.rigs import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, make_lab_rig
+from tests.builders.profiles import make_profile
+from tests.builders.rigs import EXTRA, SECOND_ACC, TEMPERATURE, UPWARD_ACC, change_rig, make_lab_rig
 from tests.builders.sessions import play_guarded
 from tests.builders.truths import seal_truth
 from tests.table_io.safety.test_tap_test import tap
 
 RATE_HZ = 2000.0
-PROFILE = Profile.model_validate(
-    {
-        "title": "short",
-        "specimen": {"mass_kg": 550.0, "gap_mm": 4.0},
-        "sweep": {
-            "start_hz": 2.4,
-            "stop_hz": 2.4,
-            "step_hz": 1.0,
-            "cycles": 4,
-            "measured_cycles": 2,
-            "directions": ("forward",),
-        },
-    }
-)
+PROFILE = make_profile(start_hz=2.4, stop_hz=2.4, step_hz=1.0, directions=("forward",))
 
 
 def acquire_sine(rig: RigConfig, samples: int = 2000) -> Block:
@@ -49,8 +36,7 @@ def acquire_sine(rig: RigConfig, samples: int = 2000) -> Block:
 
 
 def quiet(rig: RigConfig) -> RigConfig:
-    sensors = tuple(sensor.model_copy(update={"noise_rms": 0.0}) for sensor in rig.sensors)
-    return rig.model_copy(update={"sensors": sensors})
+    return change_rig(rig, every_sensor={"noise_rms": 0.0})
 
 
 def test_declared_channel_is_the_stated_sum_and_absolute_values_are_not_tared() -> None:

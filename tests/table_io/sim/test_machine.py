@@ -26,6 +26,7 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.sim.machine.flight_recorder import FlightRecorder
 from table_io.sim.machine.table import SimulatedMachine
+from tests.builders.drives import make_bump
 from tests.builders.flight_records import read_flight_record
 from tests.builders.profiles import SPECIMEN
 from tests.builders.rigs import read_rig_text
@@ -178,8 +179,7 @@ def test_queue_that_ends_in_motion_is_brought_home_and_replaced_in_time(desk: De
 
 
 def test_table_that_stands_still_in_the_middle_of_its_queue_is_not_at_rest(desk: Desk) -> None:
-    x = np.clip(np.arange(1000) / 998, 0.0, 1.0)
-    volts = np.concatenate([np.zeros(1500), 64.0 * (x * (1.0 - x)) ** 3])
+    volts = np.concatenate([np.zeros(1500), make_bump(1.0, 1000)])
     desk.drive(volts)
     desk.wait(0.1)
     desk.table.drop_controller("gone", desk.time_s)
