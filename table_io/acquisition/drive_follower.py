@@ -252,10 +252,9 @@ def measure_deviation(
 
 CHUNK_S = 0.25
 MAX_ONSET_DELAY_S = 1.5  # longest time until a soft start is detected
-MIN_SEARCH_S, MAX_SEARCH_S = (
-    1.0,
-    3.0,
-)  # of motion before the first and the last attempt to find it in the drive
+# Of motion before the first and the last attempt to find it in the drive.
+MIN_SEARCH_S = 1.0
+MAX_SEARCH_S = 3.0
 MAX_OFFSET_SD = 0.05  # of a sample: accept the fit before the last attempt
 MIN_CORRELATION = 0.9  # below this it is another drive
 MAX_DEVIATION_RATIO = 0.3  # deviation over the drive's amplitude; above, it is not the drive

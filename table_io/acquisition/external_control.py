@@ -270,10 +270,8 @@ class _ExternalSession:
             self.event_log.add_event("tare", tare.note)
         sensor = self.setup.rig.sensors[self._command_row]
         refuse_motion(self._command_m(volts), sensor, self.drive, self.rate_hz)
-        lsb, noise = (
-            2 * sensor.range_si / 2**sensor.bits,
-            self._protection.noise.get(sensor.channel),
-        )
+        lsb = 2 * sensor.range_si / 2**sensor.bits
+        noise = self._protection.noise.get(sensor.channel)
         self._follower = DriveFollower(self.drive, self.rate_hz, noise or 0.0, lsb)
         self.source.start()
         self.event_log.enter_state("waiting")

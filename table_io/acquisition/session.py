@@ -342,10 +342,8 @@ class _Session:
         if is_stop:
             self.stop("stopped" if command.name == "stop" else "aborted", command.reason)
             return ""
-        previous, index = (
-            self._state,
-            self.output_queue.first_changeable() + round(COMMAND_DELAY_S * self.rate_hz),
-        )
+        previous = self._state
+        index = self.output_queue.first_changeable() + round(COMMAND_DELAY_S * self.rate_hz)
         change = {"hold": procedure.hold_test, "resume": procedure.resume_test}[command.name]
         self._state = change(previous, index)
         if self._state is previous:

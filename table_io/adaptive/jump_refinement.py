@@ -24,10 +24,9 @@ from table_io.config.adaptive import RefineConfig
 from table_io.config.profile import Profile
 from table_io.records import Step
 
-NARROW_WIDTH_RATIO, STEEP_CHANGE_RATIO = (
-    1 / 7,
-    3.0,
-)  # a change is smooth if it shrinks nearly in proportion to the interval
+# A change is smooth if it shrinks nearly in proportion to the interval.
+NARROW_WIDTH_RATIO = 1 / 7
+STEEP_CHANGE_RATIO = 3.0
 MIN_APPROACH_VISITS = 3  # least number of visits to reach the branch again
 
 

@@ -123,10 +123,8 @@ def evaluate_gain(response: FrequencyResponse, frequency_hz: float) -> float:
     if frequency_hz > top:
         chord = _fit_polynomial(z, inverse, min(2, frequencies.size))
         value += _evaluate_polynomial(chord, frequency_hz / top) - _evaluate_polynomial(chord, 1.0)
-    min_inverse, max_inverse = (
-        float(inverse.min()) / MAX_GAIN_EXTRAPOLATION**2,
-        float(inverse.max()) * MAX_GAIN_EXTRAPOLATION**2,
-    )
+    min_inverse = float(inverse.min()) / MAX_GAIN_EXTRAPOLATION**2
+    max_inverse = float(inverse.max()) * MAX_GAIN_EXTRAPOLATION**2
     return float(min(max(value, min_inverse), max_inverse) ** -0.5)
 
 

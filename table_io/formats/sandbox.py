@@ -15,11 +15,10 @@ from typing import TypeVar
 
 from table_io.errors import InputError
 
-BASE_MEMORY_BYTES, MEMORY_PER_FILE_BYTE, MAX_MEMORY_BYTES = (
-    2**30,
-    600,
-    2**34,
-)  # address space beyond that of the parent
+# Address space beyond that of the parent.
+BASE_MEMORY_BYTES = 2**30
+MEMORY_PER_FILE_BYTE = 600
+MAX_MEMORY_BYTES = 2**34
 MAX_CPU_S = 60
 T = TypeVar("T")
 

@@ -24,10 +24,9 @@ from table_io.sensor_errors import FIT_ERROR_RATIO, PairErrors, solve_errors
 
 WINDOW_ORDERS = (0, 1, 2)
 NOISE_SIGMAS = 6.0
-MIN_AMPLITUDE_SNR, MIN_AMPLITUDE_RATIO = (
-    20.0,
-    0.3,
-)  # amplitude over its standard error, and over the motion, from which a ratio is evaluated
+# Amplitude over its standard error, and over the motion, from which a ratio is evaluated.
+MIN_AMPLITUDE_SNR = 20.0
+MIN_AMPLITUDE_RATIO = 0.3
 # Displacements, which add up, and the acceleration of one body.
 SENSOR_PAIRS = (
     (("table_disp_m",), "table_acc_m_s2"),

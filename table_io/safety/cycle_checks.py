@@ -199,11 +199,9 @@ def check_sensor_pair(
     limit, problem = MAX_MISMATCH_RATIO, "does not fit"
     if share <= MAX_MISMATCH_RATIO and baseline.is_known:
         fitted = pair.remove_errors(baseline.errors)
-        share, limit, problem = (
-            fitted.fundamental_mismatch / fitted.size,
-            MAX_MISMATCH_CHANGE,
-            "no longer fits",
-        )
+        share = fitted.fundamental_mismatch / fitted.size
+        limit = MAX_MISMATCH_CHANGE
+        problem = "no longer fits"
     max_offset = OFFSET_RANGE_RATIO * cycle.context.range_si(acceleration) + 6.0 * pair.sigma_offset
     if share <= limit:
         # A gain error within its limit may cause an apparent offset of this size.
@@ -358,10 +356,8 @@ def check_response(
         return
     lag_s = phase_lag_s(reference, cycle.omega)
     deflection = payload_deflection(cycle, lag_s)
-    gain, max_change = (
-        min(map(abs, ratios), key=lambda ratio: abs(ratio - 1.0)),
-        MAX_GAIN_CHANGE + deflection,
-    )
+    gain = min(map(abs, ratios), key=lambda ratio: abs(ratio - 1.0))
+    max_change = MAX_GAIN_CHANGE + deflection
     # Both sensors must show the change; if only one does, it is a fault of that sensor.
     if abs(gain - 1.0) > max_change:
         text = f"the gain of the table is {gain:.2f} times its earlier value; "

@@ -56,18 +56,15 @@ MAX_READ_BACK_LSB, MAX_READ_BACK_RATIO = 4.0, 0.005  # DAC steps, and fraction o
 MIN_NOISE_MARGIN_DB = 20.0
 KNOWN_MARGIN_DB = 0.5  # by which noise may be more in a second of rest than the rig file states
 MAX_OFFSET_RATIO = 0.05  # of the motion of the test, or of the gap
-MAX_RESIDUAL_MOTION_RATIO, RESIDUAL_NOISE_FACTOR = (
-    0.02,
-    2.0,
-)  # of the motion of the test, and of the noise
-MIN_LAG_SINE, MAX_LEAD_SINE = (
-    0.2,
-    -0.5,
-)  # sines that prove lag or lead; a transient may look like a small lead
-MIN_IN_PHASE_TONE, MAX_ANTIPHASE_TONE = (
-    0.5,
-    0.9,
-)  # tone of the mass: at least this in phase with the table, at most this in antiphase
+# Of the motion of the test, and of the noise.
+MAX_RESIDUAL_MOTION_RATIO = 0.02
+RESIDUAL_NOISE_FACTOR = 2.0
+# Sines that prove lag or lead; a transient may look like a small lead.
+MIN_LAG_SINE = 0.2
+MAX_LEAD_SINE = -0.5
+# Tone of the mass: at least this in phase with the table, at most this in antiphase.
+MIN_IN_PHASE_TONE = 0.5
+MAX_ANTIPHASE_TONE = 0.9
 
 
 def make_check(

@@ -63,10 +63,9 @@ from table_io.units import GRAVITY_M_S2
 
 FIRST_HOLD_KEY = 2  # keys from here on are motions of constant frequency and level
 MIN_CYCLE_COUNT = 1.0 - 1e-3  # cycles that count as a whole one
-PLAUSIBLE_GAIN_RANGE, MAX_LAG_S = (
-    (0.5, 1.5),
-    0.1,
-)  # of a table whose position is predicted sample by sample
+# Of a table whose position is predicted sample by sample.
+PLAUSIBLE_GAIN_RANGE = (0.5, 1.5)
+MAX_LAG_S = 0.1
 MAX_GAIN_STEP_RATIO = 0.1  # change of the gain between two checks up to which it is adopted
 
 
@@ -427,10 +426,8 @@ def _check_record(
     if not state.record_limit.size:
         return state, []
     played = np.flatnonzero(block.is_history)
-    first, state = (
-        state.record_samples,
-        replace(state, record_samples=state.record_samples + played.size),
-    )
+    first = state.record_samples
+    state = replace(state, record_samples=state.record_samples + played.size)
     count = min(played.size, state.record_limit.size - first)
     if count <= 0 or state.is_off_target:
         return state, []
@@ -490,10 +487,8 @@ def inspect_samples(
     values = np.ascontiguousarray(np.concatenate([state.history[0], block.values], axis=1))
     command = np.concatenate([state.history[1], observation.command_m])
     phase = np.concatenate([state.history[2], observation.phase])
-    clipped, demanded = (
-        np.ascontiguousarray(observation.clipped),
-        np.ascontiguousarray(observation.acceleration_m_s2),
-    )
+    clipped = np.ascontiguousarray(observation.clipped)
+    demanded = np.ascontiguousarray(observation.acceleration_m_s2)
     keys = _motion_keys(block, state.context.profile.swept_sine is not None)
     state = replace(state, sample_state=state.sample_state.copy())
     rows = np.empty((MAX_FINDINGS, 5))

@@ -102,10 +102,8 @@ def compute_thresholds(
     """Compute the thresholds for a rig and a test; `noise`: (rms, longest run) at rest."""
     rate_hz, limits, names = profile.acquisition.rate_hz, rig.limits, rig.channels
     rest_noise = [noise.get(name, (math.nan, 0)) for name in names]
-    rms, runs = (
-        np.array([channel_noise[0] for channel_noise in rest_noise]),
-        np.array([float(channel_noise[1]) for channel_noise in rest_noise]),
-    )
+    rms = np.array([channel_noise[0] for channel_noise in rest_noise])
+    runs = np.array([float(channel_noise[1]) for channel_noise in rest_noise])
     sigma = np.where(np.isnan(rms), 0.0, rms)
     full_scale = np.array([sensor.range_si for sensor in rig.sensors])
     lsb = np.array([sensor.lsb_si for sensor in rig.sensors])

@@ -187,10 +187,9 @@ MAX_OFFSET_RANGE = 0.2
 MAX_DRIFT_RANGE = 1e-3  # from the first quarter to the last
 MAX_SPIKE_RATIO = 8.0  # times the rms noise
 MAX_CORRELATION = 0.5  # of the noise of two channels
-MAX_ZERO_LSB, MAX_ZERO_SPAN = (
-    4.0,
-    1e-3,
-)  # command at rest: steps of both converters, and fraction of the span
+# Command at rest: steps of both converters, and fraction of the span.
+MAX_ZERO_LSB = 4.0
+MAX_ZERO_SPAN = 1e-3
 COMMAND_CHANNEL = "drive_disp_m"
 
 
@@ -541,10 +540,10 @@ def evaluate_tap(
     `reason` explains a missing response.
     """
     if response is not None and is_disturbed(stimulus, response):
-        response, reason = (
-            None,
+        response = None
+        reason = (
             "a sensor moved before the prompt or was not released; repeat, and wait for the "
-            f"prompt: {stimulus.prompt}",
+            f"prompt: {stimulus.prompt}"
         )
     if response is None:
         check_name = "shunt" if stimulus.shunt else "polarity"
@@ -628,20 +627,3 @@ def _check_shunt(stimulus: Stimulus, response: TapResponse) -> Iterator[CheckLin
         else "check volts_per_unit, range and supply of the sensor (`shaketwin calibrate`)"
     )
     yield check_value("shunt", name, shift, allowed, sensor.unit, remedy)
-
-
-__all__ = [
-    "CheckLine",
-    "RestingInputs",
-    "Stimulus",
-    "TapResponse",
-    "check_digital_inputs",
-    "check_resting_inputs",
-    "check_value",
-    "check_zero_command",
-    "evaluate_tap",
-    "find_tap_onset",
-    "is_disturbed",
-    "list_stimuli",
-    "mark_untested",
-]  # fmt: skip

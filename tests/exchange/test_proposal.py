@@ -191,10 +191,8 @@ def test_import_table_warns_of_rest_off_zero(tmp_path: Path) -> None:
         (0.0, {}, True, False), (5.0, {}, False, True), (5.0, {"rest": True}, True, False),
     ):  # fmt: skip
         name = f"{offset}{len(settings)}"
-        file, log = (
-            write_component(tmp_path / f"{name}.txt", offset=offset),
-            tmp_path / f"{name}.mcap",
-        )
+        file = write_component(tmp_path / f"{name}.txt", offset=offset)
+        log = tmp_path / f"{name}.mcap"
         notes = import_table(file, log, ImportOptions(accept=True, settings=settings)).notes
         (block,) = read_recording(log).contiguous_blocks("meas")
         assert bool(block.label[0] == Label.REST) is is_rest

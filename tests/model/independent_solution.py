@@ -136,12 +136,10 @@ class Witness:
 
         x0 (8,): the attached mass starts at rest relative to the table, its spring relaxed.
         """
-        x, t, solution, self.events = (
-            np.array([*x0, x0[0], 0.0]),
-            0.0,
-            np.full((10, times.size), np.nan),
-            0,
-        )
+        x = np.array([*x0, x0[0], 0.0])
+        t = 0.0
+        solution = np.full((10, times.size), np.nan)
+        self.events = 0
         self.way = math.copysign(1.0, x[1]) if x[1] else self.way
         step = times[1] - times[0]
         while t < times[-1]:

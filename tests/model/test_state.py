@@ -16,11 +16,9 @@ def test_blocks_of_any_size_give_the_same_bits(p, rate, size):
     base = sine(5.2 if p.gap_r < 0 else 2.2, rate, 4000 / rate)
     base[1234] *= 1.5
     whole, out, events = run(p, rate, base)
-    state, con, cut = (
-        closed_form.rest_state(p),
-        closed_form.discretized_params(p, rate),
-        np.empty_like(out),
-    )
+    state = closed_form.rest_state(p)
+    con = closed_form.discretized_params(p, rate)
+    cut = np.empty_like(out)
     for first in range(0, base.size, size):
         window = slice(first, first + size)
         part = base[window]

@@ -321,10 +321,8 @@ def test_the_size_is_the_rms_of_the_difference_over_the_signal(
     stiff = tmp_path / "stiff.toml"
     stiff.write_text(bundle.model_toml.replace("36000.0", "37800.0"))
     replay_logs(ReplayRequest([log_file], [str(stiff)], tmp_path / "out"))
-    (old,), (new,) = (
-        recording.contiguous_blocks("pred"),
-        read_recording(tmp_path / "out" / "run.mcap").contiguous_blocks("pred"),
-    )
+    (old,) = recording.contiguous_blocks("pred")
+    (new,) = read_recording(tmp_path / "out" / "run.mcap").contiguous_blocks("pred")
     sizes = report["relative_difference"]
     for name in ("free/rel_disp_m", "window/force_r1_n"):
         a, b = old.channel(name), new.channel(name)

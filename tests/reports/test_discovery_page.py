@@ -253,10 +253,8 @@ def test_logs_of_the_same_name_are_distinguished(tmp_path: Path) -> None:
 
 def test_measured_less_what_is_left_is_the_models_force(every: dict[str, DiscoveryOutput]) -> None:
     output = every["named"]
-    sheet, guess = (
-        DiscoveryView(output.discovery, output.logs).log_residuals[0],
-        output.discovery.verdict.best.fit.parameters,
-    )
+    sheet = DiscoveryView(output.discovery, output.logs).log_residuals[0]
+    guess = output.discovery.verdict.best.fit.parameters
     m = sheet.motion()
     model_at_log = guess.model_for_log(0, m)
     damper, right, left = forces_along(

@@ -182,10 +182,8 @@ def test_the_last_timing_of_each_component_counts(
 def test_nrmse_is_that_of_the_samples(recording: Recording, bundle: RunConfig) -> None:
     """Directly from the recorded samples, over those that both have."""
     comparison = summarise(recording, bundle.parameters).comparison
-    measured, predicted = (
-        recording.contiguous_blocks("meas")[0],
-        recording.contiguous_blocks("pred")[0],
-    )
+    measured = recording.contiguous_blocks("meas")[0]
+    predicted = recording.contiguous_blocks("pred")[0]
     u = measured.channel("mass_disp_m") - measured.channel("table_disp_m")
     # comparisons know whole cells of 20 samples; the first restart is at 250
     cells = slice(260, 20 * (len(measured) // 20))

@@ -172,10 +172,8 @@ def test_the_twin_is_the_plant_within_its_noise(run: tuple) -> None:
     for name, values in comparison.items():
         assert values.nrmse < 0.02, name
         assert values.free_nrmse < 0.02, name
-    predicted, block = (
-        recording.contiguous_blocks("pred")[0],
-        recording.contiguous_blocks("meas")[0],
-    )
+    predicted = recording.contiguous_blocks("pred")[0]
+    block = recording.contiguous_blocks("meas")[0]
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     error = (predicted.channel("window/rel_disp_m") - u)[501:]
     assert np.sqrt(np.mean(error**2)) < 2 * 7.1e-6  # two lasers of 5 um, and what they started

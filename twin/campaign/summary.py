@@ -201,10 +201,9 @@ def _find_peaks(run: MergedRun) -> dict[str, Peak]:
     return {name: peak for name, peak in peaks.items() if peak is not None}
 
 
-NORMALIZED_BY_U_STAR, NORMALIZED_BY_A_STAR = (
-    ("eta_d", "eta_r", "eta_l"),
-    ("eta_a",),
-)  # quantities divided by u* and by a*
+# Quantities divided by u* and by a*.
+NORMALIZED_BY_U_STAR = ("eta_d", "eta_r", "eta_l")
+NORMALIZED_BY_A_STAR = ("eta_a",)
 
 
 def merge_summaries(

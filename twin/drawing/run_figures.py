@@ -92,10 +92,8 @@ def draw_histories(run: ReportData) -> CaptionedFigures:
                     plot_history(histories, motion.select_last(HISTORY_CYCLES), **style)
             contact_motion = twin if run.source == "twin" or measured is None else measured
             if contact_motion is not None:
-                shown, colour = (
-                    contact_motion.select_last(HISTORY_CYCLES),
-                    DIRECTION_COLOURS[direction],
-                )
+                shown = contact_motion.select_last(HISTORY_CYCLES)
+                colour = DIRECTION_COLOURS[direction]
                 for ax in histories:
                     shade_contact(ax, shown, colour, CONTACT_ALPHAS, run.contact_n)
             if run.gaps_m is not None:

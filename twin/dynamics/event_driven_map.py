@@ -343,10 +343,8 @@ class EventDrivenMap(PeriodMap):
 
     def sample_motion(self, x: Float1D, periods: int, count: int) -> Float2D:
         each = max(1, math.ceil(SAMPLES_PER_CYCLE * periods / count))
-        drive, motion = (
-            self._make_drive(each * count, periods),
-            np.empty((OUTPUT_COUNT, each * count)),
-        )
+        drive = self._make_drive(each * count, periods)
+        motion = np.empty((OUTPUT_COUNT, each * count))
         self._advance(self._make_states(x[None]), drive, each * count, motion, _NO_EVENTS)
         return motion[:, each - 1 :: each]
 

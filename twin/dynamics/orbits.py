@@ -277,10 +277,8 @@ def motion_size(x: Float1D, scales: Float1D) -> float:
 
 def reduce_period(orbit: Orbit) -> Orbit:
     """Return an orbit with its least period; itself if that is what it has."""
-    scales, limit = (
-        orbit.period_map.scales,
-        SAME_ORBIT * motion_size(orbit.x, orbit.period_map.scales),
-    )
+    scales = orbit.period_map.scales
+    limit = SAME_ORBIT * motion_size(orbit.x, orbit.period_map.scales)
     for periods in range(1, orbit.periods // 2 + 1):
         returned = motion_size(orbit.phases[periods] - orbit.x, scales)
         if orbit.periods % periods == 0 and returned < limit:

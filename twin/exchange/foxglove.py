@@ -29,12 +29,10 @@ from twin.recording.tabular import (
 )
 from twin.transport.codec import build_flat_schema
 
-MEASURED_TOPIC, PREDICTED_TOPIC, CURVES_TOPIC, EVENTS_TOPIC = (
-    "/measured",
-    "/twin",
-    "/prc",
-    "/events",
-)
+MEASURED_TOPIC = "/measured"
+PREDICTED_TOPIC = "/twin"
+CURVES_TOPIC = "/prc"
+EVENTS_TOPIC = "/events"
 Fields = list[tuple[str, str]]  # name, protobuf type; numbered from 2, after the timestamp
 LOG_FIELDS: Fields = [("level", "int32"), ("message", "string"), ("name", "string")]
 LEVEL_WARNING, LEVEL_INFO = 3, 2  # levels of foxglove.Log

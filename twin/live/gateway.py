@@ -360,10 +360,8 @@ class Gateway:
     def _measure_latency(self) -> None:
         """Sample the relay latency at every tenth block and publish a Timing once a second."""
         self.block_count += 1
-        start, block = (
-            self.status.start,
-            self.block_count % LATENCY_EVERY_BLOCKS == 0 and self.status.block,
-        )
+        start = self.status.start
+        block = self.block_count % LATENCY_EVERY_BLOCKS == 0 and self.status.block
         if not start or not block:
             return
         latency_s = self.clock.now() - start.epoch_s - (block.end - 1) / block.rate_hz

@@ -28,10 +28,9 @@ from twin.results.players import (
     make_simulator,
 )
 
-MIN_GAP_MM, GAP_TOLERANCE_MM = (
-    -40.0,
-    0.005,
-)  # limit and tolerance of the search for permanent contact
+# Limit and tolerance of the search for permanent contact.
+MIN_GAP_MM = -40.0
+GAP_TOLERANCE_MM = 0.005
 MAX_HYSTERESIS_HZ = 2.0  # from a frequency within a hysteresis to its end
 BRANCH_MARGIN_HZ = 0.5  # by which a branch is followed beyond a hysteresis
 MIN_BAND_VALUE = 0.05  # of an exponent or a share in a band of a curve

@@ -153,10 +153,8 @@ def _draw_loops(
         label_panel(bottom, "abcdef"[column + len(resonances)])
         p = resonance.case.parameters
         for direction in DIRECTIONS:
-            motion, style = (
-                _take_first_cycle(resonance.motions[direction]),
-                experiment_style(direction, 1.6),
-            )
+            motion = _take_first_cycle(resonance.motions[direction])
+            style = experiment_style(direction, 1.6)
             plot_inertia_loop(top, motion, p.mass, True, **style)
             plot_bumper_loops(bottom, motion, True, **style)
         orbits = find_coexisting_orbits(

@@ -260,10 +260,8 @@ class _Scanner:
 
     def is_mcap(self) -> bool:
         """Detect an MCAP file by its leading or trailing magic, or by its header record."""
-        start, end = (
-            self._read_at(0, len(MAGIC) + RECORD_HEADER.size),
-            self._read_at(self.size - len(MAGIC)),
-        )
+        start = self._read_at(0, len(MAGIC) + RECORD_HEADER.size)
+        end = self._read_at(self.size - len(MAGIC))
         if MAGIC.startswith(start[: len(MAGIC)]) or end == MAGIC:
             return True
         return len(start) == 17 and start[8] == HEADER and UINT64.unpack_from(start, 9)[0] < 1000

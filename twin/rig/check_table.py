@@ -244,11 +244,9 @@ def _record_response(
     sensor moves earlier, the operator is prompted again, at most MAX_TRIES times.
     """
     volts_per_unit = np.array([[sensor.volts_per_unit] for sensor in result.rig.sensors])
-    block_samples, pre_trigger_samples, history_samples = (
-        round(BLOCK_S * rate_hz),
-        round(PRE_TRIGGER_S * rate_hz),
-        round(rate_hz),
-    )
+    block_samples = round(BLOCK_S * rate_hz)
+    pre_trigger_samples = round(PRE_TRIGGER_S * rate_hz)
+    history_samples = round(rate_hz)
 
     def make_response(volts: Float2D) -> TapResponse:
         resting = result.resting

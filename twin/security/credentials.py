@@ -35,12 +35,10 @@ from twin.security.access_control import (
 )
 from twin.security.certificate_authority import certificate_validity, verify_certificate
 
-AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, ACCESS_FILE = (
-    "ca.pem",
-    "certificate.pem",
-    "key.pem",
-    "access.toml",
-)
+AUTHORITY_FILE = "ca.pem"
+CERTIFICATE_FILE = "certificate.pem"
+KEY_FILE = "key.pem"
+ACCESS_FILE = "access.toml"
 EXPIRY_WARNING_DAYS = 30  # before a certificate expires
 MAX_NAME_LENGTH = 64  # X.509's upper bound of a common name
 OTHERS_MODE_BITS, WRITE_BY_OTHERS_MODE_BITS = 0o077, 0o022

@@ -98,10 +98,8 @@ class Scene:
             np.broadcast_to(np.array(colour, np.uint8), table.shape)
             for colour in (STEEL_COLOUR, MASS_COLOUR)
         ]
-        contact_colour, idle_colour = (
-            np.array(CONTACT_COLOUR, np.uint8),
-            np.array(IDLE_COLOUR, np.uint8),
-        )
+        contact_colour = np.array(CONTACT_COLOUR, np.uint8)
+        idle_colour = np.array(IDLE_COLOUR, np.uint8)
         for name, sign, gap in self.sides:
             force = motion.force_r if name == "right" else -motion.force_l
             centre, half_size = self._bumper_box(x, sign, gap, sign * motion.u)

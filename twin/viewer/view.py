@@ -165,10 +165,8 @@ class RerunView:
             self._sink.send_strips("prc/now", index, marks)
 
     def _draw_predicted(self, block: Block) -> None:
-        free, window = (
-            extract_motion(extract_track(block, "free")),
-            extract_motion(extract_track(block, "window")),
-        )
+        free = extract_motion(extract_track(block, "free"))
+        window = extract_motion(extract_track(block, "window"))
         self._send_lines("u/twin", window.index, 1e3 * free.u, 1e3 * window.u)
         self._send_lines("a/twin", window.index, free.acc, window.acc)
         self._send_lines("force/twin", window.index, 1e-3 * window.force_r, 1e-3 * window.force_l)

@@ -16,11 +16,10 @@ from rerun.experimental import ViewerClient
 from table_io.errors import InputError, format_pip_line
 from twin.viewer.address import find_free_address, is_listening, viewer_url
 
-SETTLE_CHECK_S, MAX_CHECKS, MAX_CHECKS_LIVE = (
-    1.0,
-    20,
-    3,
-)  # screenshots are compared until the picture is stable
+# Screenshots are compared until the picture is stable.
+SETTLE_CHECK_S = 1.0
+MAX_CHECKS = 20
+MAX_CHECKS_LIVE = 3
 MAX_TRIES = 5
 EXIT_TIMEOUT_S = 2.0  # for a viewer that has broken the connection
 WEB_VIEWER_ADDRESS, WEB_DATA_ADDRESS = "127.0.0.1:9090", "127.0.0.1:9900"
@@ -127,10 +126,8 @@ def _wait_until_settled(process: "subprocess.Popen[bytes]", client: Any, max_che
     image = b""
     for _ in range(max_checks):
         _wait_or_fail(process, SETTLE_CHECK_S)
-        previous, image = (
-            image,
-            _retry_request(process, lambda: client.take_screenshot(max_size=960)),
-        )
+        previous = image
+        image = _retry_request(process, lambda: client.take_screenshot(max_size=960))
         if image == previous:
             return
 

@@ -76,10 +76,8 @@ class RigTasks:
         wiring = rig.require_section("ni", NiWiring)
         inputs = {analog_input.channel: analog_input for analog_input in wiring.inputs}
         for sensor in rig.sensors:
-            analog_input, full_scale_v = (
-                inputs[sensor.channel],
-                abs(sensor.range * sensor.volts_per_unit),
-            )
+            analog_input = inputs[sensor.channel]
+            full_scale_v = abs(sensor.range * sensor.volts_per_unit)
             self.input.ai_channels.add_ai_voltage_chan(
                 analog_input.physical,
                 "",

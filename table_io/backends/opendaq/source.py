@@ -306,11 +306,9 @@ class OpenDaqSource:
         deadline_s, earliest_epoch_s = self._clock_window
         earliest_epoch_s = min(earliest_epoch_s, now_s - (self._assembly.end - 1) / self.rate_hz)
         if now_s > deadline_s:
-            self._epoch_s, deadline_s, earliest_epoch_s = (
-                earliest_epoch_s,
-                now_s + CLOCK_WINDOW_S,
-                np.inf,
-            )
+            self._epoch_s = earliest_epoch_s
+            deadline_s = now_s + CLOCK_WINDOW_S
+            earliest_epoch_s = np.inf
         self._epoch_s = min(self._epoch_s, earliest_epoch_s)
         self._clock_window = (deadline_s, earliest_epoch_s)
 

@@ -168,11 +168,9 @@ def parse_orbit_plan(text: str, name: str) -> OrbitPlan:
 def pack_harmonics(coefficients: Complex1D) -> Float1D:
     """Return complex harmonics U_0 .. U_H, (H + 1,), as a real vector, (2 H + 1,)."""
     vector = np.empty(2 * coefficients.size - 1)
-    vector[0], vector[1::2], vector[2::2] = (
-        coefficients[0].real,
-        coefficients[1:].real,
-        coefficients[1:].imag,
-    )
+    vector[0] = coefficients[0].real
+    vector[1::2] = coefficients[1:].real
+    vector[2::2] = coefficients[1:].imag
     return vector
 
 

@@ -311,10 +311,8 @@ class SimulatedMachine:
             case MessageKind.BEAT:
                 return []
             case MessageKind.TARE:
-                samples, max_samples = (
-                    message.index,
-                    MAX_PAYLOAD_BYTES // (8 * len(session.plant.channels)),
-                )
+                samples = message.index
+                max_samples = MAX_PAYLOAD_BYTES // (8 * len(session.plant.channels))
                 if not 0 <= samples <= max_samples:
                     raise ValueError(f"tare of {samples} samples; at most {max_samples}")
                 return [values_message(MessageKind.TARED, session.plant.tare(samples).T)]

@@ -101,10 +101,8 @@ class InterlockedTable:
             if inner_observer is not None:
                 inner_observer(first, command_m, signals)
             if np.abs(signals[0] - self._rest_position_m).max() > MAX_REST_MOTION_M:
-                self._rest_position_m, self._last_moved = (
-                    float(signals[0, -1]),
-                    first + command_m.size,
-                )
+                self._rest_position_m = float(signals[0, -1])
+                self._last_moved = first + command_m.size
 
         plant.observer = observe
         self._freeze_reason = self._alarm = ""

@@ -145,10 +145,8 @@ class RegressionProblem:
         m, rows = self.motion, self.residuals.entry_row
         p = self.parameters.model_for_log(self.residuals.log_number, m).parameters
         entries = np.flatnonzero((rows == 1) | (rows == 2))
-        samples, side = (
-            self.residuals.entry_sample[entries],
-            np.where(rows[entries] == 1, 1.0, -1.0),
-        )
+        samples = self.residuals.entry_sample[entries]
+        side = np.where(rows[entries] == 1, 1.0, -1.0)
         depth = side * self.u[samples] - np.where(side > 0, p.gap_r, p.gap_l)
         speed = side * m.v[samples]
         columns = {

@@ -32,10 +32,9 @@ from tests.builders.profiles import make_profile
 from tests.builders.rigs import RIG
 
 A = 0.05 * GRAVITY_M_S2
-NATURAL_HZ, DAMPING = (
-    1.2876,
-    0.1236,
-)  # of the paper's damper: K = 36 kN/m, C = 1.1 kN s/m, M = 550 kg
+# Of the paper's damper: K = 36 kN/m, C = 1.1 kN s/m, M = 550 kg.
+NATURAL_HZ = 1.2876
+DAMPING = 0.1236
 
 
 def profile(tool: str, card: dict[str, Any], **sweep: Any) -> Profile:

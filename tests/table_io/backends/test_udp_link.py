@@ -317,10 +317,8 @@ def test_c_target_survives_invalid_packets(tmp_path: Path) -> None:
                 large = [far[i] for i in chance.integers(0, len(far), 3)]
                 values = chance.choice([0.0, 1e300, np.nan, np.inf], chance.integers(0, 129))
                 if sequence % 100 == 1:
-                    kind, values = (
-                        PacketKind.CLAIM,
-                        np.array([RATE_HZ, 9.0, 0.0, 1.0, 1.0, 1.0, 1.0]),
-                    )
+                    kind = PacketKind.CLAIM
+                    values = np.array([RATE_HZ, 9.0, 0.0, 1.0, 1.0, 1.0, 1.0])
                 queue = sequence - int(chance.integers(2))
                 index, want_from, want_to = large
                 word = RigPacket(

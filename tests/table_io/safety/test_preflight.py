@@ -239,36 +239,6 @@ def test_worst_stop_of_a_history_is_that_of_a_decay_from_every_sample(rate_hz: f
 # Refusals: the last value that is allowed, and the next one that is not
 
 
-@pytest.mark.parametrize(
-    ("rig", "where", "key", "number", "allowed"),
-    [
-        (change_rig(limits={"stroke_mm": 40.0}), SLOWEST, "displacement", 49.67, "at most 40 mm"),
-        (change_rig(output={"bits": 12}), "step 1 (10 Hz)", "amplitude", 4.2, "at least 20"),
-        (
-            change_rig(limits={"piston_area_cm2": 100.0, "peak_flow_l_min": 90.0}),
-            SLOWEST,
-            "flow",
-            93.7,  # Q = A v: 100 cm2 at 156 mm/s
-            "at most 90 l/min",
-        ),
-        (
-            change_rig(sensors={"table_acc_m_s2": {"range": 0.05}}),
-            "step 1 (10 Hz forward)",
-            "table_acc_m_s2",
-            0.05,
-            "",
-        ),
-    ],
-)
-def test_refusal_states_step_number_and_limit(
-    rig: RigConfig, where: str, key: str, number: float, allowed: str
-) -> None:
-    (fault,) = list_faults(demand_sweep(make_test(), rig), rig)
-    assert (fault.where.split(" and ")[0], fault.key) == (where, key)
-    assert read_number(fault) == pytest.approx(number, rel=0.05)
-    assert not allowed or fault.allowed == allowed
-
-
 def test_all_exceeded_limits_stand_in_one_refusal() -> None:
     low = {"stroke_mm": 1.0, "velocity_mm_s": 1.0, "acceleration_g": 0.01, "force_kn": 0.1}
     test = make_test(acquisition={"rate_hz": 1500.0})
@@ -488,16 +458,6 @@ def test_level_that_fits_is_in_proportion_to_the_largest_excess(
     # A stepped motion beyond the limit says nothing of the level of a history.
     sine = set_demand(SMALL, demand, 1e3 * excess * allowed)
     assert preflight._suggest_level((*demands, sine), test, rig) == remedy
-
-
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@given(value=st.floats(1e-9, 1e9))
-@settings(max_examples=100, derandomize=True)
-def test_round_towards_zero_keeps_three_digits(sign: float, value: float) -> None:
-    rounded = sign * preflight._round_towards_zero(sign * value)
-    assert rounded == pytest.approx(float(f"{rounded:.3g}"), rel=1e-12)
-    assert rounded <= value * (1 + 1e-12)
-    assert value - rounded < 0.0100001 * 10.0 ** math.floor(math.log10(value))
 
 
 # Warnings

@@ -83,15 +83,11 @@ class Along:
 
     def __init__(self, plant: Plant, seconds: float = 2.5) -> None:
         samples = round(seconds / H)
-        path, state = (
-            np.concatenate([np.zeros(plant.history_samples), command(samples)]),
-            plant.rest_state(),
-        )
-        out, states, sample = (
-            np.empty((7, samples)),
-            np.empty((state.size, samples)),
-            np.empty((7, 1)),
-        )
+        path = np.concatenate([np.zeros(plant.history_samples), command(samples)])
+        state = plant.rest_state()
+        out = np.empty((7, samples))
+        states = np.empty((state.size, samples))
+        sample = np.empty((7, 1))
         for k in range(samples):
             plant.advance(state, path[k : k + plant.history_samples + 1], sample)
             out[:, k], states[:, k] = sample[:, 0], state
