@@ -14,12 +14,7 @@ from table_io.block import Float1D, Float2D
 from table_io.clock import local_datetime
 from table_io.config.rig import OutputConfig, RigConfig
 from table_io.config.sensor import SensorConfig
-from table_io.config.tare import (
-    MAX_TARE_AGE_H,
-    MAX_TARE_LEAD_H,
-    PRELOADED_CHANNELS,
-    TareRecord,
-)
+from table_io.config.tare import MAX_TARE_AGE_H, MAX_TARE_LEAD_H, PRELOADED_CHANNELS, TareRecord
 from table_io.errors import InputError
 
 

@@ -119,11 +119,7 @@ def describe_limits(field: FieldInfo) -> str:
 
 
 def _collect_limits(
-    annotation: Any,
-    metadata: Any,
-    limits: dict[str, Any],
-    types: list[str],
-    choices: list[str],
+    annotation: Any, metadata: Any, limits: dict[str, Any], types: list[str], choices: list[str]
 ) -> None:
     """Add the limits of an annotation and of what it is made of."""
     for item in metadata:

@@ -32,11 +32,7 @@ from table_io.config.base import (
 )
 from table_io.config.channel import ChannelConfig
 from table_io.config.plugins import list_entry_points, load_entry_point
-from table_io.config.sensor import (
-    CalibrationRecord,
-    SensorConfig,
-    check_sensor_unit,
-)
+from table_io.config.sensor import CalibrationRecord, SensorConfig, check_sensor_unit
 from table_io.config.tare import TareRecord
 from table_io.errors import InputError, suggest
 

@@ -5,11 +5,7 @@ from pathlib import Path
 
 from table_io.config.base import load_config, parse_toml
 from table_io.config.rig import RigConfig, require_backend
-from table_io.config.sensor import (
-    CalibrationFile,
-    CalibrationRecord,
-    format_calibration_toml,
-)
+from table_io.config.sensor import CalibrationFile, CalibrationRecord, format_calibration_toml
 from table_io.config.tare import TareFile, TareRecord, format_tare_toml
 from table_io.errors import InputError
 

@@ -75,7 +75,4 @@ def format_tare_toml(record: TareRecord) -> str:
 
 def measure_tare(volts: Float2D) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return (mean, rms noise) in V of each row of volts at rest; lost samples are ignored."""
-    return (
-        tuple(np.nanmean(volts, axis=1).tolist()),
-        tuple(np.nanstd(volts, axis=1).tolist()),
-    )
+    return (tuple(np.nanmean(volts, axis=1).tolist()), tuple(np.nanstd(volts, axis=1).tolist()))

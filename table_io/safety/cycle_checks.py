@@ -164,11 +164,7 @@ def sum_channels(rig: RigConfig, values: Float2D, names: tuple[str, ...]) -> Flo
 
 
 def compare_sensor_pair(
-    cycle: DriveCycle,
-    names: tuple[str, ...],
-    acceleration: str,
-    filtered: Float1D,
-    low_cut: float,
+    cycle: DriveCycle, names: tuple[str, ...], acceleration: str, filtered: Float1D, low_cut: float
 ) -> WeakFormPair:
     """Compare displacement channels with an acceleration channel.
 

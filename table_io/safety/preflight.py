@@ -156,11 +156,7 @@ def _add_feedback(
     curvature = 60.0 * np.abs(x * (1.0 - x) * (1.0 - 2.0 * x)) / seconds**2
     decaying = a * (1.0 - smoothstep(x)) + 2.0 * slope * math.sqrt(2.0 * a * d) + curvature * d
     decaying += envelope_acceleration(replace(stop, count=round(seconds * rate_hz)), x, rate_hz)
-    return (
-        peaks[0] + d,
-        peaks[1] + math.sqrt(2.0) * v,
-        max(peaks[2] + a, float(decaying.max())),
-    )
+    return (peaks[0] + d, peaks[1] + math.sqrt(2.0) * v, max(peaks[2] + a, float(decaying.max())))
 
 
 def _history_demands(

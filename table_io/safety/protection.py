@@ -40,13 +40,7 @@ from table_io.safety.cycle_checks import (
     ProtectionContext,
     SwingAverage,
 )
-from table_io.safety.findings import (
-    Finding,
-    Suspicion,
-    confirm_suspicion,
-    format_si,
-    to_finding,
-)
+from table_io.safety.findings import Finding, Suspicion, confirm_suspicion, format_si, to_finding
 from table_io.safety.sample_checks import (
     HALF_CYCLE,
     LOOP_CHECK_KEY,

@@ -8,12 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from table_io.acquisition.session import (
-    OperatorCommand,
-    SessionSetup,
-    find_take_back,
-    run_session,
-)
+from table_io.acquisition.session import OperatorCommand, SessionSetup, find_take_back, run_session
 from table_io.backends import Backend, open_backend
 from table_io.block import Block, Float1D, join_blocks
 from table_io.clock import ManualClock

@@ -16,12 +16,7 @@ import pytest
 from numba import float64
 
 from table_io import compilation
-from table_io.compilation import (
-    fingerprint_kernel,
-    jit_helper,
-    jit_kernel,
-    remove_unused_kernels,
-)
+from table_io.compilation import fingerprint_kernel, jit_helper, jit_kernel, remove_unused_kernels
 from twin.laws.expression import build_function
 
 # A kernel of a package that is not ours, as a plug-in brings it; `{}` are changed by the tests.

@@ -23,8 +23,7 @@ from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 def campaign_command(
     file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help=describe_names("Campaign", "campaigns")),
+        Path, typer.Argument(metavar="FILE", help=describe_names("Campaign", "campaigns"))
     ],
     out: OutOption = None,
     resume: Annotated[

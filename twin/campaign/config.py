@@ -27,9 +27,7 @@ class CampaignRun(ConfigModel):
         description="Name of a test, or path of a .toml file relative to this file."
     )
     label: str = Field(
-        "",
-        pattern=LABEL_PATTERN,
-        description="Name of the run; empty: name of the profile.",
+        "", pattern=LABEL_PATTERN, description="Name of the run; empty: name of the profile."
     )
     prompt: str = Field("", description="Set-up change to confirm before the run; empty: none.")
     notes: str = Field("", description="Notes of the operator; they go into the recording.")

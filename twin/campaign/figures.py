@@ -16,13 +16,7 @@ from matplotlib.ticker import NullLocator
 from table_io.block import Float1D, Float2D
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.records import PrcPoint
-from twin.campaign.gap_comparison import (
-    ETA_A,
-    ETA_D,
-    FORCE_RATIO,
-    GapComparison,
-    format_gap,
-)
+from twin.campaign.gap_comparison import ETA_A, ETA_D, FORCE_RATIO, GapComparison, format_gap
 from twin.campaign.summary import CampaignData, CampaignRunData, describe_normalization
 from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
 from twin.drawing.pictures import direction_handles, save_figures

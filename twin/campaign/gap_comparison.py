@@ -20,14 +20,7 @@ from table_io.block import Float1D, Float2D
 from table_io.config.excitation.record import RecordedHistory
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
-from twin.campaign.result import (
-    BestGap,
-    GapResult,
-    GapSpread,
-    PeakSource,
-    RecordResponse,
-    Spread,
-)
+from twin.campaign.result import BestGap, GapResult, GapSpread, PeakSource, RecordResponse, Spread
 from twin.results.contracts import MotionResult, RunSummary
 from twin.results.paper_cases import name_gap
 

@@ -10,15 +10,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, PlainSerializer
 
 from twin.campaign.state import OperatorAnswer, RunPart, Status
-from twin.results.contract import (
-    Acceleration,
-    Contract,
-    Hertz,
-    Metres,
-    Number,
-    Real,
-    RealRatio,
-)
+from twin.results.contract import Acceleration, Contract, Hertz, Metres, Number, Real, RealRatio
 from twin.results.contracts import Direction, RunInfo, RunSummary, StepEntry
 
 Place = tuple[Hertz, Direction]

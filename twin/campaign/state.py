@@ -94,15 +94,11 @@ def read_state(folder: Path) -> CampaignState:
         return CampaignState.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise InputError(
-            "no campaign to resume in this folder",
-            where=path,
-            remedy="omit --resume to start one",
+            "no campaign to resume in this folder", where=path, remedy="omit --resume to start one"
         ) from None
     except ValidationError as error:
         raise InputError(
-            f"damaged: {error}",
-            where=path,
-            remedy="repair it, or start a campaign in a new folder",
+            f"damaged: {error}", where=path, remedy="repair it, or start a campaign in a new folder"
         ) from None
 
 

@@ -186,9 +186,7 @@ def draw_section(points: Float2D, title: str) -> CaptionedFigure:
 
 
 def draw_bifurcation_diagram(
-    up: BifurcationDiagram,
-    down: BifurcationDiagram,
-    bands: Sequence[ChaosRange] = (),
+    up: BifurcationDiagram, down: BifurcationDiagram, bands: Sequence[ChaosRange] = ()
 ) -> CaptionedFigure:
     """Draw u at phase 0 and the largest exponent over a parameter, with the chaotic bands."""
     figure = Figure(figsize=(10, 6.2))

@@ -64,11 +64,7 @@ def save_figures(
     folder.mkdir(parents=True, exist_ok=True)
     pictures = []
     style = RC_PARAMS | (DARK_RC_PARAMS if dark else {})
-    with (
-        mpl.rc_context(style),
-        pause_collection(),
-        show_status("drawing the figures") as show_part,
-    ):
+    with mpl.rc_context(style), pause_collection(), show_status("drawing the figures") as show_part:
         for drawing in figures:
             show_part(drawing.title)
             path = folder / f"{drawing.name}.png"

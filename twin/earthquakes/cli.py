@@ -97,8 +97,7 @@ def table_twin_command(
 
 def record_command(
     spectrum: Annotated[
-        Path,
-        typer.Argument(metavar="SPECTRUM", help="CSV file with `frequency_hz` and `sa_g`."),
+        Path, typer.Argument(metavar="SPECTRUM", help="CSV file with `frequency_hz` and `sa_g`.")
     ],
     like: Annotated[
         Path,

@@ -64,10 +64,7 @@ def compute_command(
 
 
 def compute_correction(
-    lacking_m: Float1D,
-    model: PredictiveModel,
-    rate_hz: float,
-    band_hz: tuple[float, float],
+    lacking_m: Float1D, model: PredictiveModel, rate_hz: float, band_hz: tuple[float, float]
 ) -> Float1D:
     """Return the command for what the table lacks in m, (sample,), by the linear inverse."""
     count = lacking_m.size

@@ -47,11 +47,7 @@ from twin.earthquakes.table_judgement import (
     prepare_data,
     try_hydraulic_fit,
 )
-from twin.earthquakes.table_response import (
-    CROSSOVER_HZ,
-    BandProjection,
-    PredictiveModel,
-)
+from twin.earthquakes.table_response import CROSSOVER_HZ, BandProjection, PredictiveModel
 from twin.recording.reader import Recording
 from twin.results.recordings import build_provenance, open_recording
 from twin.results.tracking import find_band

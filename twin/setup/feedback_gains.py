@@ -166,11 +166,7 @@ def settle_gains(loops: Sequence[OpenLoop], timing: FeedbackTiming) -> FeedbackG
     gain, rate_gain = coarse[int(worst(coarse).argmin())].tolist()
     fine = _make_grid(
         (gain - GAIN_STEP / 2, gain + GAIN_STEP / 2, FINE_GAIN_STEP),
-        (
-            rate_gain - RATE_GAIN_STEP_S / 2,
-            rate_gain + RATE_GAIN_STEP_S / 2,
-            FINE_RATE_GAIN_STEP_S,
-        ),
+        (rate_gain - RATE_GAIN_STEP_S / 2, rate_gain + RATE_GAIN_STEP_S / 2, FINE_RATE_GAIN_STEP_S),
     )
     multipliers = worst(fine)
     best = int(multipliers.argmin())

@@ -9,11 +9,7 @@ from table_io.clock import RealClock
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from twin.setup.run_config import RunConfig
-from twin.system.resource_limits import (
-    MIN_RUN_MEMORY_BYTES,
-    require_memory,
-    require_open_files,
-)
+from twin.system.resource_limits import MIN_RUN_MEMORY_BYTES, require_memory, require_open_files
 
 MIN_BLOCK_S, MAX_BLOCK_S = 0.002, 0.05  # protection checks once per block
 

@@ -14,11 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from table_io.block import Block
-from table_io.config.excitation.swept_sine import (
-    TABLE_ACCELERATION,
-    PredictedSweep,
-    SweptSine,
-)
+from table_io.config.excitation.swept_sine import TABLE_ACCELERATION, PredictedSweep, SweptSine
 from table_io.config.profile import NOTCH, LoopCheckConfig, Profile
 from table_io.config.rig import RigConfig
 from table_io.control.sweep_control import LIMIT_SHARE

@@ -18,13 +18,7 @@ from table_io.acquisition.session import (
 from table_io.backends import open_backend
 from table_io.block import Block
 from table_io.clock import ManualClock
-from table_io.records import (
-    Comparison,
-    Record,
-    RunStart,
-    RunStop,
-    StepAdded,
-)
+from table_io.records import Comparison, Record, RunStart, RunStop, StepAdded
 from twin.compare import pipeline
 from twin.recording.mcap_log import LogWriter
 from twin.setup.realtime import check_full_speed

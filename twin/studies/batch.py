@@ -136,10 +136,7 @@ def read_models(words: Sequence[str], profile: Path) -> dict[str, tuple[ModelCon
 
 
 def build_cases(
-    profile: Profile,
-    configs: Mapping[str, ModelConfig],
-    gaps: Sequence[float],
-    context: str,
+    profile: Profile, configs: Mapping[str, ModelConfig], gaps: Sequence[float], context: str
 ) -> list[StudyCase]:
     """Build a case per model and gap, models outermost; without `gaps`, at the profile's gap."""
     if len(configs) * max(len(gaps), 1) > MAX_CASES:

@@ -5,13 +5,7 @@ from typing import Annotated
 
 import typer
 
-from twin.options import (
-    OutOption,
-    SchedulerOption,
-    WorkersOption,
-    complete_names,
-    describe_names,
-)
+from twin.options import OutOption, SchedulerOption, WorkersOption, complete_names, describe_names
 
 
 def map_command(

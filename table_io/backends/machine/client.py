@@ -12,11 +12,7 @@ from typing import NoReturn
 import numpy as np
 
 from table_io.backends import SAMPLE_TIMEOUT_S, MachineLost
-from table_io.backends.command_buffer import (
-    SampleBuffer,
-    find_newest_sample,
-    refuse_late_command,
-)
+from table_io.backends.command_buffer import SampleBuffer, find_newest_sample, refuse_late_command
 from table_io.backends.machine.protocol import (
     REPLACE_AFTER_S,
     MachineConfig,

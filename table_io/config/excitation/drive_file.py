@@ -101,7 +101,4 @@ def parse_drive_provenance(text: str, name: str) -> Provenance | None:
 
 def _measure(target_m: Float1D) -> dict[str, float]:
     """Return peak and rms of a target in m by name."""
-    return {
-        "peak": float(np.abs(target_m).max()),
-        "rms": float(np.sqrt(np.mean(target_m**2))),
-    }
+    return {"peak": float(np.abs(target_m).max()), "rms": float(np.sqrt(np.mean(target_m**2)))}

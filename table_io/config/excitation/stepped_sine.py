@@ -18,11 +18,7 @@ from table_io.config.excitation import (
     ExcitationPlan,
     register_excitation,
 )
-from table_io.config.excitation.waveform import (
-    LevelPoints,
-    check_points_in_band,
-    interpolate_level,
-)
+from table_io.config.excitation.waveform import LevelPoints, check_points_in_band, interpolate_level
 from table_io.errors import InputError
 from table_io.records import Step
 from table_io.units import GRAVITY_M_S2

@@ -16,19 +16,9 @@ import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float2D
-from table_io.config.base import (
-    Count,
-    NonNegative,
-    Number,
-    Positive,
-    find_attached_text,
-)
+from table_io.config.base import Count, NonNegative, Number, Positive, find_attached_text
 from table_io.config.excitation import Excitation, ExcitationPlan, register_excitation
-from table_io.config.excitation.waveform import (
-    LevelPoints,
-    check_points_in_band,
-    interpolate_level,
-)
+from table_io.config.excitation.waveform import LevelPoints, check_points_in_band, interpolate_level
 from table_io.errors import InputError
 from table_io.records import SweepLevel
 from table_io.units import GRAVITY_M_S2

@@ -129,9 +129,7 @@ def test_every_sample_is_labelled_by_its_place_in_the_drive(loop_check_recording
         assert len(wrong) - len(unseen) <= len(np.flatnonzero(np.diff(drive)))
 
 
-def test_loop_check_and_alignment_are_recorded(
-    loop_check_recording: Followed,
-) -> None:
+def test_loop_check_and_alignment_are_recorded(loop_check_recording: Followed) -> None:
     checks = loop_check_recording.of(Check)
     assert len(checks) > 30
     assert all(check.passed for check in checks)

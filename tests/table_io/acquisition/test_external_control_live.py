@@ -80,14 +80,7 @@ def test_drive_is_exported_played_followed_recorded_and_replayed(tmp_path: Path)
 def test_only_a_followed_table_is_played_by_somebody_else() -> None:
     play = find_config("g0", "tests")
     with raises_input_error(where=f"--play {play}"):
-        serve_table(
-            "simulated",
-            None,
-            None,
-            1.0,
-            sys.stdout,
-            controller=ExternalController(play),
-        )
+        serve_table("simulated", None, None, 1.0, sys.stdout, controller=ExternalController(play))
 
 
 def test_run_without_device_is_refused(tmp_path: Path) -> None:

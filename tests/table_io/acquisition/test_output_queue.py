@@ -12,12 +12,7 @@ from table_io.clock import ManualClock
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget, Trajectory
 from tests.builders.rigs import command_to_si
-from tests.table_io.acquisition.test_session import (
-    RATE_HZ,
-    RIG,
-    Machine,
-    machine,
-)
+from tests.table_io.acquisition.test_session import RATE_HZ, RIG, Machine, machine
 
 BLOCK_SAMPLES = 20
 

@@ -403,10 +403,7 @@ def test_feed_that_comes_too_late_lets_the_queued_decay_play(after: int) -> None
     whole = join_blocks(blocks(items))
     # What is said to have been played is what was played.
     np.testing.assert_allclose(
-        whole.channel("drive_disp_m"),
-        subject.take_command(0, len(whole)),
-        rtol=0,
-        atol=ROUNDING_M,
+        whole.channel("drive_disp_m"), subject.take_command(0, len(whole)), rtol=0, atol=ROUNDING_M
     )
     (trip,) = (item for item in items if isinstance(item, Trip))
     decay_start = int(np.flatnonzero(whole.label == Label.STOP)[0])

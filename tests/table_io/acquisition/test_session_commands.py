@@ -49,9 +49,7 @@ REST_SAMPLES = round(profile().acquisition.rest_s * RATE_HZ)
 BLOCK_COUNT = plan_sweep(profile()).planned_end // BLOCK_SAMPLES
 FIRST_MOVING = sine_segments(plan_sweep(profile()))[0].start // BLOCK_SAMPLES + 1
 LAW = settings(
-    max_examples=6,
-    derandomize=True,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    max_examples=6, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 VERDICTS = {"stop": "stopped", "abort": "aborted"}
 
@@ -390,9 +388,7 @@ def test_feedback_that_is_too_late_because_the_lead_ran_out_is_an_underrun(
     monkeypatch.setattr(procedure, "answer_block", answer_with_feedback)
     monkeypatch.setattr(OutputQueue, "replace_drive", lambda *_: False)
     monkeypatch.setattr(
-        OutputQueue,
-        "has_run_out",
-        property(lambda queue: queue.acquired > 100 * BLOCK_SAMPLES),
+        OutputQueue, "has_run_out", property(lambda queue: queue.acquired > 100 * BLOCK_SAMPLES)
     )
     items = list(session(machine(stopping=True), Stop()))  # less than the lead plays
     (trip,) = (item for item in items if isinstance(item, Trip))

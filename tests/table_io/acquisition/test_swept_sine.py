@@ -16,13 +16,7 @@ from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import Event, SweepLevel, Trip
 from tests.builders.profiles import make_history_profile
-from tests.builders.rigs import (
-    SECOND_ACC,
-    TEMPERATURE,
-    make_faulty_rig,
-    make_lab_rig,
-    read_rig,
-)
+from tests.builders.rigs import SECOND_ACC, TEMPERATURE, make_faulty_rig, make_lab_rig, read_rig
 from tests.builders.sessions import PlayedSession, play_session
 
 GRAVITY_M_S2 = 9.80665
@@ -280,10 +274,7 @@ def test_dead_channel_that_is_not_the_table_aborts() -> None:
 
 def test_resonance_faster_than_the_compressor_stops_at_the_abort_line() -> None:
     profile = make_swept_profile(
-        control_channels=["mass_acc_m_s2"],
-        start_hz=0.8,
-        octaves_per_min=6.0,
-        compression=0.02,
+        control_channels=["mass_acc_m_s2"], start_hz=0.8, octaves_per_min=6.0, compression=0.02
     )
     played = play_session(profile)
     (trip,) = played.select(Trip)

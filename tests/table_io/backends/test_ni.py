@@ -195,18 +195,14 @@ class Paced:
         return self._clock.now()
 
 
-def test_device_with_more_memory_than_stated_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_device_with_more_memory_than_stated_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Task, "onboard_samples", property(lambda task: 8191))
     with pytest.raises(InputError, match="7680 ms") as error:
         Bed().backend().open()
     assert (error.value.key, error.value.value) == ("ni.held_by_device_ms", 20.0)
 
 
-def test_driver_that_lets_nothing_be_replaced_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_driver_that_lets_nothing_be_replaced_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     write = SimulatedDaqDevice.write
 
     def only_behind(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
@@ -219,9 +215,7 @@ def test_driver_that_lets_nothing_be_replaced_is_refused(
         Bed().backend().open()
 
 
-def test_rate_that_the_device_only_comes_near_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_rate_that_the_device_only_comes_near_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     timing = SimulatedDaqDevice.configure_timing
 
     def near(
@@ -253,9 +247,7 @@ def test_command_that_does_not_stand_at_zero_is_not_started_from(
     assert error.value.where == f"rig {bed.rig.name}: drive_disp_m"
 
 
-def test_table_that_moves_is_waited_for_and_then_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_table_that_moves_is_waited_for_and_then_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed()
     resting = bed.table.read_at_rest
 

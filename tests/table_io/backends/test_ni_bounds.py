@@ -178,9 +178,7 @@ def test_tare_is_read_in_pieces_that_come_in_time(rate_hz: float) -> None:
     backend.close()
 
 
-def test_error_before_the_start_is_a_lost_machine(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_error_before_the_start_is_a_lost_machine(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed()
     backend = bed.backend()
     backend.open()
@@ -194,9 +192,7 @@ def test_error_before_the_start_is_a_lost_machine(
     backend.close()
 
 
-def test_driver_that_ignores_a_replacement_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_driver_that_ignores_a_replacement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     write = SimulatedDaqDevice.write
 
     def ignoring(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
@@ -240,9 +236,7 @@ def test_device_in_use_is_refused_with_a_remedy() -> None:
     assert error.value.remedy == REMEDIES[-50103]
 
 
-def test_moving_write_position_is_no_other_rig(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_moving_write_position_is_no_other_rig(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed()
     gone = open_backend(bed)
     gone.start()
@@ -258,9 +252,7 @@ def test_moving_write_position_is_no_other_rig(
     bed.backend().open()
 
 
-def test_device_with_fixed_memory_is_opened(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_device_with_fixed_memory_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
     bed = Bed(CARD.replace("held_by_device_ms = 20.0", "held_by_device_ms = 4200.0"))
     reserve = bed.device.reserve
 

@@ -7,12 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from table_io.config.calibration import (
-    command_to_volts,
-    compute_tare,
-    measure_noise,
-    volts_to_si,
-)
+from table_io.config.calibration import command_to_volts, compute_tare, measure_noise, volts_to_si
 from table_io.config.rig import OutputConfig
 from table_io.config.sensor import SensorConfig
 from tests.builders.rigs import RIG, command_to_si, si_to_volts

@@ -8,11 +8,7 @@ import pytest
 
 from table_io.block import Label
 from table_io.config.profile import ControlConfig
-from table_io.control.amplitude_control import (
-    Tuning,
-    is_within_tolerance,
-    update_target,
-)
+from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
 from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
 from table_io.excitation.trajectory import SineTarget
 from table_io.records import FrequencyResponse, Level, Step

@@ -12,12 +12,7 @@ import pytest
 
 from table_io.block import Float1D, Label
 from table_io.config.base import PROFILES_DIR
-from table_io.config.excitation import (
-    ENTRY_POINT_GROUP,
-    EXCITATIONS,
-    History,
-    find_excitation,
-)
+from table_io.config.excitation import ENTRY_POINT_GROUP, EXCITATIONS, History, find_excitation
 from table_io.config.profile import Profile, load_profile
 from table_io.errors import InputError
 from table_io.excitation.drive import MAX_STOP_RATIO, Drive
@@ -50,12 +45,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "half_sine": {"duration_s": 0.2, "acceleration_g": 0.2, "pulses": 2, "windows": 2},
     "chirp": {"start_hz": 1.0, "stop_hz": 8.0, "duration_s": 12.0, "acceleration_g": 0.1},
     "random": {"low_hz": 0.5, "high_hz": 12.0, "rms_g": 0.03, "duration_s": 10.0},
-    "swept_sine": {
-        "start_hz": 1.5,
-        "stop_hz": 3.0,
-        "octaves_per_min": 6.0,
-        "displacement_mm": 4.0,
-    },
+    "swept_sine": {"start_hz": 1.5, "stop_hz": 3.0, "octaves_per_min": 6.0, "displacement_mm": 4.0},
     "cyclic": {"protocol": [[5.0, 0.5, 2], [10.0, 1.0, 3]], "windows": 4},
     "pulse_train": {"height_mm": 5.0, "width_s": 0.8, "period_s": 1.5, "windows": 3},
 }

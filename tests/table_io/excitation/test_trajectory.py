@@ -9,12 +9,7 @@ import pytest
 
 from table_io.block import Label
 from table_io.excitation.drive import Drive, HistorySegment, Segment, peak_acceleration_ratio
-from table_io.excitation.trajectory import (
-    SineTarget,
-    Trajectory,
-    plan_sweep,
-    start_trajectory,
-)
+from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep, start_trajectory
 from table_io.records import Step
 from tests.builders.profiles import make_profile
 from tests.table_io.excitation.test_kinds import profile as make_example

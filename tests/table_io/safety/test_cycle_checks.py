@@ -123,10 +123,7 @@ def make_cycle(
 
 @pytest.mark.parametrize("label", [Label.SETTLE, Label.MEASURE])
 @given(
-    edge=EDGES,
-    alarm=st.floats(0.02, 0.5),
-    abort_db=st.floats(1.0, 12.0),
-    level=st.floats(0.1, 5.0),
+    edge=EDGES, alarm=st.floats(0.02, 0.5), abort_db=st.floats(1.0, 12.0), level=st.floats(0.1, 5.0)
 )
 @MANY
 def test_check_level_alarm_and_stop(
@@ -201,11 +198,7 @@ def test_check_table_mean_at_its_limit(edge: Edge, amplitude_m: float, sigma: fl
 @given(edge=EDGES, half_m=st.floats(0.0, 0.05))
 @MANY
 def test_check_mass_mean_at_its_limit(
-    rig: RigConfig,
-    gaps: dict[str, float],
-    asymmetry_m: float,
-    edge: Edge,
-    half_m: float,
+    rig: RigConfig, gaps: dict[str, float], asymmetry_m: float, edge: Edge, half_m: float
 ) -> None:
     limit = 0.1e-3 + 0.35 * half_m + asymmetry_m
     swing = SwingAverage(edge.signed_factor * limit, half_m, 20)
@@ -304,11 +297,7 @@ def test_check_response_of_both_sensors(
 
 # Laws of the comparison of a displacement with an acceleration
 
-PAIRS = [
-    (RIG, SENSOR_PAIRS[0], 2.0),
-    (RIG, SENSOR_PAIRS[1], 5.0),
-    (REL_RIG, SENSOR_PAIRS[2], 5.0),
-]
+PAIRS = [(RIG, SENSOR_PAIRS[0], 2.0), (RIG, SENSOR_PAIRS[1], 5.0), (REL_RIG, SENSOR_PAIRS[2], 5.0)]
 
 
 def make_pair(

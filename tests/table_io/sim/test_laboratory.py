@@ -56,10 +56,7 @@ def laboratory(
 
 
 def measured(
-    *entries: Imperfection,
-    rate: float = RATE_HZ,
-    signals: Float2D | None = None,
-    **values: Float1D,
+    *entries: Imperfection, rate: float = RATE_HZ, signals: Float2D | None = None, **values: Float1D
 ) -> Float2D:
     """Readings without noise where the named channels and the signals of the plant are so."""
     count = signals.shape[1] if signals is not None else len(next(iter(values.values())))

@@ -348,9 +348,7 @@ def test_large_motion_is_landed_within_the_span(
     assert not played[volts.size + landed.size :].any()
 
 
-def test_gap_between_two_queues_holds_the_last_value_whatever_was_played_before(
-    desk: Desk,
-) -> None:
+def test_gap_between_two_queues_holds_the_last_value_whatever_was_played_before(desk: Desk) -> None:
     desk.drive(np.append(sine(2.2, 3.0), np.zeros(4000)))
     desk.wait(1.5)
     desk.say(RigPacket(PacketKind.RELEASE))

@@ -235,11 +235,7 @@ def measure_basins(chunk: CaseChunk) -> Mapping[str, npt.NDArray[Any]]:
     return chunk.collect_numbers(BASINS.variables, measure)
 
 
-BASIN_DEFAULTS = {
-    "basins.disp_mm": 6.0,
-    "basins.vel_m_s": 0.15,
-    "basins.starts_per_axis": 15.0,
-}
+BASIN_DEFAULTS = {"basins.disp_mm": 6.0, "basins.vel_m_s": 0.15, "basins.starts_per_axis": 15.0}
 BASINS = Outcome(
     "basins",
     "basins of attraction at one frequency",

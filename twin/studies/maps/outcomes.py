@@ -99,9 +99,7 @@ class CaseChunk:
         return np.stack([missing if array is None else array for array in arrays])
 
     def collect_numbers(
-        self,
-        variables: Sequence["OutcomeVariable"],
-        compute: Callable[[int, SampledCase], FloatND],
+        self, variables: Sequence["OutcomeVariable"], compute: Callable[[int, SampledCase], FloatND]
     ) -> dict[str, FloatND]:
         """Return the array of each variable, (case,), from a number of each in every case."""
         rows = self.collect(compute, (len(variables),))
