@@ -34,7 +34,7 @@ from tests.builders.rigs import RIG
 A = 0.05 * GRAVITY_M_S2
 # Of the paper's damper: K = 36 kN/m, C = 1.1 kN s/m, M = 550 kg.
 NATURAL_HZ = 1.2876
-DAMPING = 0.1236
+DAMPING_RATIO = 0.1236
 
 
 def profile(tool: str, card: dict[str, Any], **sweep: Any) -> Profile:
@@ -61,7 +61,7 @@ Specimen = Callable[[Step], StepResult]
 def linear(f: float, natural_hz: float = NATURAL_HZ) -> complex:
     """u in m of M u'' + C u' + K u = -M A, complex at the phase of A."""
     w, n = 2 * math.pi * f, 2 * math.pi * natural_hz
-    return -A / (n * n - w * w + 2j * DAMPING * n * w)
+    return -A / (n * n - w * w + 2j * DAMPING_RATIO * n * w)
 
 
 @dataclass
@@ -159,7 +159,7 @@ def test_by_peak_the_maximum_of_u_is_found_below_it(level: float) -> None:
         profile("track", tracking("peak", resolution_hz=0.005)),
         lambda step: result(step, linear(step.frequency_hz), level=next(errors)),
     )
-    peak = NATURAL_HZ * math.sqrt(1 - 2 * DAMPING**2)
+    peak = NATURAL_HZ * math.sqrt(1 - 2 * DAMPING_RATIO**2)
     assert peak == pytest.approx(1.268, abs=0.001)
     assert at(outcome.conclusion) == pytest.approx(peak, abs=0.004)
     assert len(outcome.visits) <= 9
@@ -183,7 +183,7 @@ def test_resonance_that_moves_is_followed(by: str, direction: str) -> None:
     outcome = play_policy(profile("track", card, directions=[direction]), warming)
     last = NATURAL_HZ * (1 - 0.01 * len(outcome.results) / 30)
     if by == "peak":
-        last *= math.sqrt(1 - 2 * DAMPING**2)
+        last *= math.sqrt(1 - 2 * DAMPING_RATIO**2)
     words = outcome.conclusion.split()
     followed = float(words[words.index("to", words.index("followed")) + 1])
     assert followed == pytest.approx(last, abs=0.003)
