@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from table_io.block import Label
 from table_io.config.base import PROFILES_DIR
@@ -288,17 +289,19 @@ def test_a_table_of_the_page_has_the_values_and_marks_the_best() -> None:
 
 def test_the_lines_of_the_figures_are_the_values() -> None:
     comparison = compare(make_runs())
-    over_gap, trade_off = draw_gap_figures(comparison)
-    panel = over_gap.figure.axes[0]
+    over_gap, trade_off = (drawn.figure for drawn in draw_gap_figures(comparison))
+    assert isinstance(over_gap, Figure)
+    assert isinstance(trade_off, Figure)
+    panel = over_gap.axes[0]
     drawn = [np.asarray(line.get_ydata()) for line in panel.lines]
     for row in range(3):
         np.testing.assert_array_equal(drawn[row], comparison.values["measured", "eta_a"][row])
     np.testing.assert_allclose(drawn[3], [1.0, 2.0, 0.8, 0.9])
     assert [tick.get_text() for tick in panel.get_xticklabels()] == ["G∞", "G16", "G4", "G0"]
-    median = trade_off.figure.axes[0].lines[3]
+    median = trade_off.axes[0].lines[3]
     np.testing.assert_allclose(np.asarray(median.get_xdata()), [1.0, 0.75, 0.3, 0.2])
     np.testing.assert_allclose(np.asarray(median.get_ydata()), [1.0, 2.0, 0.8, 0.9])
-    names = {text.get_text() for text in trade_off.figure.axes[0].texts}
+    names = {text.get_text() for text in trade_off.axes[0].texts}
     assert {*PLANTED, "G∞", "G16", "G4", "G0"} <= names
 
 

@@ -12,12 +12,13 @@ from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
 from twin.discovery.discover import discover_effects, prepare_problem
 from twin.discovery.law_search import propose_law, search_laws, select_law
-from twin.discovery.law_terms import FAMILIES, LAW_PREFIX, list_law_candidates
+from twin.discovery.law_terms import LAW_PREFIX, list_law_candidates
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import EffectKey
 from twin.discovery.symbolic_regression import make_term
 from twin.laws.effect_file import format_effect_file
 from twin.laws.expression import parse_unit
+from twin.laws.terms import FAMILIES
 
 
 def search(truth):

@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_customer_report_states_texts_limits_and_the_stop(folder: Path) -> None:
     report = build_customer_report(load_report_data(folder, read_recording(folder / "run.mcap")))
-    cover = dict(report.cover)
+    cover = {row[0]: row[1] for row in report.cover}
     assert cover["Laboratory"] == "Shake & Co"
     assert len(cover["Recording, SHA-256"]) == 64
     sections = {section.title: section for section in report.sections}

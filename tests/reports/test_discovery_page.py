@@ -155,8 +155,8 @@ def test_the_page_says_the_verdict_the_gap_and_what_to_do(output: DiscoveryOutpu
     assert f'<p class="verdict {output.verdict.verdict}">' in page
     assert output.verdict.why in page.replace("&#39;", "'")
     assert output.verdict.next_run[1:] in page
-    for value in (gap.held_out_before, gap.held_out_after, gap.noise_floor):
-        assert f"{value:.3g}" in page
+    for misfit in (gap.held_out_before, gap.held_out_after, gap.noise_floor):
+        assert f"{misfit:.3g}" in page
     for effect in output.verdict.effects:
         assert effect.id in page
         for name, value in effect.parameters.items():

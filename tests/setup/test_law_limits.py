@@ -118,7 +118,7 @@ def test_twin_that_fails_departs_and_has_no_score(tmp_path: Path) -> None:
     for event in events[0]:
         name = "free" if "free-running" in event.text else "window"
         rows = [row for row, each in enumerate(predicted.channels) if each.startswith(name)]
-        is_finite = np.isfinite(predicted.values[rows]).all(axis=0)
+        is_finite = np.asarray(np.isfinite(predicted.values[rows]).all(axis=0))
         assert f"failed from sample {event.index}" in event.text
         assert list(is_finite[event.index - 1 : event.index + 1]) == [True, False]
     summary = summarise(recording, config.parameters)

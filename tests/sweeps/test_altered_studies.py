@@ -11,10 +11,10 @@ import pytest
 
 from table_io.errors import InputError
 from tests.sweeps.small_study import make_stored_study, write_study
+from twin.studies import DEFINITION_FILE
 from twin.studies.maps import task
 from twin.studies.maps.results import open_study
 from twin.studies.maps.store import (
-    DEFINITION_FILE,
     MANIFEST_FILE,
     Manifest,
     StoredChunk,

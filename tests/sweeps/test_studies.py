@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
@@ -312,6 +313,7 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     cases = figures.group_cases(read_batch_rows(out / "batch.csv"))
     own = {gap: curves for (label, gap), curves in cases.items() if label == "snm"}
     family = figures.draw_family("snm", own).figure
+    assert isinstance(family, Figure)
     words = [text.get_text() for text in family.legends[0].get_texts()]
     assert words == ["no bumpers", "G = 4 mm", "G = 0 mm", "G = −1 mm", "forward", "backward"]
     for ax in family.axes:
@@ -322,12 +324,14 @@ def test_the_pictures_name_what_is_in_them(profile: Path) -> None:
     assert top < family.axes[1].get_ylim()[1] < 1.3 * top
     beside = figures.draw_models(4.0, {label: case for (label, gap), case in cases.items()
                                        if gap == 4.0}).figure  # fmt: skip
+    assert isinstance(beside, Figure)
     words = [text.get_text() for text in beside.legends[0].get_texts()]
     assert words == ["snm", "hard", "forward", "backward"]
     (gaps,) = figures.draw_gap_figure(
         "snm",
         [case for case in SweepSummary.read(out / "summary.json", "").cases if case.model == "snm"],
     )
+    assert isinstance(gaps.figure, Figure)
     assert all(ax.get_ylabel() for ax in gaps.figure.axes)
 
 
@@ -336,6 +340,7 @@ def test_many_gaps_are_read_off_a_scale(profile: Path) -> None:
         read_batch_rows(simulate_batch(profile, [], ["0:20:2"]) / "batch.csv")
     )
     family = figures.draw_family("snm", {gap: curves for (_, gap), curves in cases.items()}).figure
+    assert isinstance(family, Figure)
     assert family.axes[-1].get_ylabel() == "total gap in mm"
     colours = {line.get_color() for line in family.axes[0].lines}
     assert len(colours) == 11

@@ -192,7 +192,8 @@ def _judge_predictions(
     stronger, unused = map(plant.simulate, (STRONGER_TEST, UNUSED_TEST))
     m = residuals.motion()
     models = [fitted.fit.parameters.model_for_log(0, m) for fitted in (null, best)]
-    noise = residuals.force_noise(m, m.mass_kg) * residuals.weight
+    weights = [residuals.weights.get(row, 1.0) for row in FORCE_ROWS]
+    noise = residuals.force_noise(m, m.mass_kg) * np.array(weights)
     motion = _derive_motion(stronger)
     outside = [*find_range_exits(models[1], motion)]
     before, after = (measure_curve_error(model, unused) for model in models)

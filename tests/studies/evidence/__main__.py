@@ -341,7 +341,7 @@ def main() -> None:
             if options.out:
                 options.out.write_text("\n".join(map(json.dumps, rows)))
     for group in groups:
-        scores = [r["score"] for r in rows if r["group"] == group]
+        scores = [str(r["score"]) for r in rows if r["group"] == group]
         print(group, {s: scores.count(s) for s in sorted({*scores})}, "of", len(scores))
 
 
