@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import expm
 
 from table_io.block import Float1D, Float2D
 from table_io.errors import InputError
@@ -205,6 +204,8 @@ def build_propagators(p: Coefficients) -> Float2D:
     result = np.zeros((8 * n, n))
     if not p.is_linear:
         return result
+    from scipy.linalg import expm  # slow to import, and the plain model needs none
+
     for mode in range(4):
         generator = _generator_matrix(p, mode)
         result[mode * n : (mode + 1) * n] = generator
