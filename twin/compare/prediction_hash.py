@@ -19,7 +19,8 @@ def hash_cells(
     Cells end at multiples of `cell_samples`; the first is shorter if the twin started inside it.
     `pending` and `new` are (channel, sample); sample `end` follows the last of `new`.
     """
-    values = np.concatenate([pending, new], axis=1) if pending.shape[1] else new
+    known = np.where(np.isnan(new), np.nan, new) if np.isnan(new).any() else new
+    values = np.concatenate([pending, known], axis=1) if pending.shape[1] else known
     first, start, hashes = end - values.shape[1], 0, []
     for stop in range(-first % cell_samples or cell_samples, values.shape[1] + 1, cell_samples):
         hashes.append(PredictionHash(first + start, stop - start, _digest(values[:, start:stop])))
@@ -29,5 +30,4 @@ def hash_cells(
 
 def _digest(values: Float2D) -> bytes:
     """Return the hash of (channel, sample), as in an encoded block but with one kind of NaN."""
-    known = np.where(np.isnan(values), np.nan, values).astype("<f8", copy=False)
-    return blake2b(known.tobytes(), digest_size=DIGEST_BYTES).digest()
+    return blake2b(values.astype("<f8", copy=False).tobytes(), digest_size=DIGEST_BYTES).digest()

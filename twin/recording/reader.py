@@ -1,7 +1,7 @@
 """Log reader: all valid items of a log in order of sample index, and a list of the damage."""
 
-import hashlib
 import re
+import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -258,7 +258,7 @@ class _Entry(NamedTuple):
 
     topic: str
     sequence: int
-    key: bytes  # the payload, or the hash of that of a block, which is large
+    key: bytes  # the payload, or the checksum of that of a block, which is large
     item: StoredItem
     run: str
     message: LogMessage | None = None  # where it is kept
@@ -294,7 +294,7 @@ def _decode_messages(
             continue
         kept = message if keeps_messages else None
         if isinstance(item, Block):
-            key = hashlib.blake2b(payload, digest_size=16).digest()
+            key = zlib.crc32(payload).to_bytes(4)
             entries.append(_Entry(topic, message.sequence, key, store.add(item), run, kept))
         else:
             entries.append(_Entry(topic, message.sequence, payload, item, run, kept))

@@ -178,9 +178,6 @@ class LogMessage(NamedTuple):
     publish_time: int = 0
 
 
-_RawMessage = tuple[int, int, int, int, bytes]  # channel, sequence, log and publish time, payload
-
-
 @dataclass(frozen=True, slots=True)
 class Damage:
     """Unreadable range of a file: `size` bytes from byte `offset`, and the reason."""
@@ -252,8 +249,8 @@ class _Scanner:
     wanted_topics: frozenset[str] | None
     recovered: RecoveredLog = field(default_factory=RecoveredLog)
     topic_by_channel: dict[int, str] = field(default_factory=dict)
-    raw_messages: list[_RawMessage] = field(default_factory=list)
     skipped_channels: set[int] = field(default_factory=set)  # of unwanted topics
+    unnamed_channels: set[int] = field(default_factory=set)  # of messages before their channel
     crc: int = 0  # since the start, or since the end of the data section
     remaining_work: int = 0
     remaining_memory: int = 0  # bytes
@@ -307,8 +304,8 @@ class _Scanner:
         except OSError:
             return bytes(min(count, self.size - offset))
 
-    def _reserve_memory(self, size: int) -> None:
-        self.remaining_memory -= ENTRY_OVERHEAD_BYTES + size
+    def _reserve_memory(self, size: int, entries: int = 1) -> None:
+        self.remaining_memory -= ENTRY_OVERHEAD_BYTES * entries + size
         if self.remaining_memory < 0:
             raise MemoryError
 
@@ -351,7 +348,7 @@ class _Scanner:
             content, zlib.crc32(RECORD_HEADER.pack(opcode, len(content)), previous_crc)
         )
         if opcode == CHUNK:
-            self.raw_messages += self._parse_messages(self._decompress(content))
+            self.recovered.messages += self._parse_messages(self._decompress(content))
         elif opcode == DATA_END:
             self._check_crc(
                 content, previous_crc, offset, "the data differ from those that were written"
@@ -370,7 +367,7 @@ class _Scanner:
             self._reserve_memory(16 * len(content))  # pairs of short strings
             self.recovered.metadata.setdefault(name, parse_string_map(content, end))
         else:
-            self.raw_messages += self._parse_messages(
+            self.recovered.messages += self._parse_messages(
                 RECORD_HEADER.pack(opcode, len(content)) + content
             )
 
@@ -379,28 +376,34 @@ class _Scanner:
         if UINT32.unpack(content[-4:])[0] not in (0, crc) and not self.recovered.damage:
             self._note_damage(offset, 0, reason)
 
-    def _parse_messages(self, data: bytes) -> list[_RawMessage]:
+    def _parse_messages(self, data: bytes) -> list[LogMessage]:
         """Return the messages in a chunk and register its channels."""
-        messages: list[_RawMessage] = []
+        messages: list[LogMessage] = []
         max_records = self.remaining_work // WORK_PER_RECORD
-        count = 0
+        topics, skipped, size = self.topic_by_channel, self.skipped_channels, MESSAGE_HEADER.size
+        count = kept_bytes = 0
         for count, (opcode, begin, end) in enumerate(iter_records(data), 1):
             if count > max_records:
                 break
             if opcode == MESSAGE:
-                header = MESSAGE_HEADER.unpack_from(data, begin)
-                if header[0] not in self.skipped_channels:
-                    self._reserve_memory(end - begin)
-                    messages.append((*header, data[begin + MESSAGE_HEADER.size : end]))
+                channel, sequence, time, published = MESSAGE_HEADER.unpack_from(data, begin)
+                if channel in skipped:
+                    continue
+                if (topic := topics.get(channel)) is None:
+                    topic = f"{UNNAMED_TOPIC_PREFIX}{channel}"
+                    self.unnamed_channels.add(channel)
+                payload = data[begin + size : end]
+                messages.append(LogMessage(topic, time, payload, sequence, published))
+                kept_bytes += end - begin
             elif opcode == CHANNEL:
                 channel = int.from_bytes(data[begin : begin + 2], "little")
-                if channel not in self.topic_by_channel:
-                    self.topic_by_channel[channel] = parse_string(data[begin:end], 4)[0]
+                if channel not in topics:
+                    topics[channel] = parse_string(data[begin:end], 4)[0]
                     self._reserve_memory(end - begin)
-                topic = self.topic_by_channel[channel]
-                if self.wanted_topics is not None and topic not in self.wanted_topics:
-                    self.skipped_channels.add(channel)
+                if self.wanted_topics is not None and topics[channel] not in self.wanted_topics:
+                    skipped.add(channel)
         self.remaining_work -= WORK_PER_RECORD * count
+        self._reserve_memory(kept_bytes, len(messages))
         return messages
 
     def _decompress(self, content: bytes) -> bytes:
@@ -459,15 +462,17 @@ class _Scanner:
 
     def _assign_topics(self) -> None:
         """Set the topic of each message; its channel record may be anywhere in the file."""
-        for channel in {raw[0] for raw in self.raw_messages} - self.topic_by_channel.keys():
-            self.topic_by_channel[channel] = f"{UNNAMED_TOPIC_PREFIX}{channel}"
-            self.recovered.is_intact = False
-        self.recovered.topics = frozenset(self.topic_by_channel.values())
-        self.recovered.messages = [
-            LogMessage(self.topic_by_channel[channel], log_time, payload, sequence, publish_time)
-            for channel, sequence, log_time, publish_time, payload in self.raw_messages
-            if channel not in self.skipped_channels
-        ]
+        topics = self.topic_by_channel
+        if unnamed := {f"{UNNAMED_TOPIC_PREFIX}{n}": n for n in self.unnamed_channels}:
+            self.recovered.is_intact &= self.unnamed_channels <= topics.keys()
+            for name, channel in unnamed.items():
+                topics.setdefault(channel, name)
+            self.recovered.messages = [
+                message._replace(topic=topics.get(unnamed.get(message.topic, -1), message.topic))
+                for message in self.recovered.messages
+                if unnamed.get(message.topic) not in self.skipped_channels
+            ]
+        self.recovered.topics = frozenset(topics.values())
 
 
 def work_limit(size: int) -> int:
