@@ -7,7 +7,7 @@ import pytest
 
 from table_io.config.base import format_toml
 from table_io.records import Agreement, Event
-from table_io.sim.imperfections import Level, draw_laboratory
+from tests.builders.laboratories import Level, draw_laboratory
 from tests.compare.test_monitoring import EFFECT, monitor_session, warnings
 
 

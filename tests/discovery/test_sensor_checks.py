@@ -12,7 +12,7 @@ import pytest
 from scipy import signal
 
 from table_io.block import Block, Float1D, Label, join_blocks
-from table_io.sim.imperfections import draw_laboratory
+from tests.builders.laboratories import draw_laboratory
 from tests.discovery.played import SNM, blocks
 from twin.discovery.discover import PreparedLog, prepare_problem
 from twin.discovery.sensor_checks import SensorCheck, check_sensors

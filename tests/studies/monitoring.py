@@ -18,7 +18,7 @@ import numpy as np
 from table_io.block import Block
 from table_io.config.base import PROFILES_DIR, format_toml
 from table_io.records import Event, Record
-from table_io.sim.imperfections import Level, draw_laboratory
+from tests.builders.laboratories import Level, draw_laboratory
 from tests.builders.truths import hide_truth
 from twin.compare.monitoring import EVENT_KINDS
 from twin.setup.run_config import RunConfig, from_texts

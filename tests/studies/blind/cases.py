@@ -22,8 +22,8 @@ from table_io.sim.imperfections import (
     IMPERFECTION_IDS,
     HiddenParameter,
     Imperfection,
-    draw_laboratory,
 )
+from tests.builders.laboratories import draw_laboratory
 
 NUMBERS_PER_CELL = 1000  # case numbers reserved per cell
 RESIDUAL_SIZES = (1.5, 3.0, 10.0)  # residual of the base model over the noise floor

@@ -14,7 +14,7 @@ from table_io.config.base import format_toml
 from table_io.config.profile import Profile
 from table_io.records import FrequencyResponse
 from table_io.sim.config import FAULT_KINDS
-from table_io.sim.imperfections import draw_laboratory
+from tests.builders.laboratories import draw_laboratory
 from tests.builders.profiles import make_profile, read_shipped_profile
 from tests.builders.rigs import make_faulty_rig
 from tests.builders.sessions import GuardedDrive, play_guarded

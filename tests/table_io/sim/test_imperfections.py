@@ -14,12 +14,11 @@ from table_io.sim.imperfections import (
     IMPERFECTION_BY_ID,
     IMPERFECTION_DEFINITIONS,
     IMPERFECTION_IDS,
-    LABORATORY_CHANNELS,
     Imperfection,
     ImperfectionDefinition,
-    draw_laboratory,
     resolve_sides,
 )
+from tests.builders.laboratories import LABORATORY_CHANNELS, draw_laboratory
 from tests.input_errors import raises_input_error
 
 DOC = Path(__file__).resolve().parents[3] / "table_io" / "sim" / "IMPERFECTIONS.md"

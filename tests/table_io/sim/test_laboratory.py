@@ -19,11 +19,11 @@ from table_io.sim.imperfections import (
     IMPERFECTION_IDS,
     Imperfection,
     ImperfectionDefinition,
-    draw_laboratory,
 )
 from table_io.sim.laboratory import Laboratory
 from table_io.sim.plant import Plant
 from table_io.sim.simulated_table import Digitizer, SimulatedBackend, hide_laws
+from tests.builders.laboratories import draw_laboratory
 from tests.builders.profiles import SPECIMEN
 from tests.builders.rigs import RIG, change_rig
 from tests.builders.truths import seal_truth
