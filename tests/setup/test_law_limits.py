@@ -94,14 +94,14 @@ def test_law_too_steep_for_the_rate_is_refused(
         read_run_config(write_profile(tmp_path, model))
 
 
-def failing_model(folder: Path) -> Model:
+def make_failing_model(folder: Path) -> Model:
     """Return a model whose law is not finite from 2.08 mm on, as a replay may be given one."""
     config, _ = load_model_config(write_model(folder, LOG, "k = 1e3, q = 480.0"))
     return config.build_model(read_run_config(write_profile(folder, "snm")).profile.specimen)
 
 
 def test_twin_that_fails_departs_and_has_no_score(tmp_path: Path) -> None:
-    model = failing_model(tmp_path)
+    model = make_failing_model(tmp_path)
     events = []
     for block in (50, 20):  # no result depends on the blocks
         config = replace(read_run_config(write_profile(tmp_path, "snm", block)), model=model)
@@ -132,7 +132,7 @@ def test_twin_that_fails_departs_and_has_no_score(tmp_path: Path) -> None:
 
 
 def test_simulated_twin_that_fails_says_from_which_sample(tmp_path: Path) -> None:
-    model = failing_model(tmp_path)
+    model = make_failing_model(tmp_path)
     config = replace(read_run_config(write_profile(tmp_path, "snm")), model=model)
     simulate_ideal(config, "own", tmp_path / "run.mcap", lambda _: None)
     recording = read_recording(tmp_path / "run.mcap")

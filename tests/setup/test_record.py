@@ -94,7 +94,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunConfig, Recording,
 Run = tuple[RunConfig, Recording, Any]
 
 
-def measured(recording: Recording) -> Block:
+def join_measured(recording: Recording) -> Block:
     return join_blocks(recording.contiguous_blocks("meas"))
 
 
@@ -104,7 +104,7 @@ def test_the_table_follows_the_record_after_a_loop_check(run: Run) -> None:
     checks = recording.records(Check)
     assert len(checks) > 20
     assert all(check.passed for check in checks)
-    block = measured(recording)
+    block = join_measured(recording)
     block = block.cut(round(summary.windows[0].from_s * block.rate_hz), block.end)
     command = config.drive.command(config.drive.segments[-1].start, len(block))
     assert np.abs(block.channel("drive_disp_m") - command).max() < 2e-6
@@ -121,12 +121,12 @@ def test_record_has_no_results_of_a_stepped_sine(run: Run) -> None:
     assert not recording.records(PrcPoint)
     assert summary.steps == summary.jumps == summary.hysteresis == []
     assert summary.u_star_m is None
-    assert (measured(recording).cycle == -1).all()
+    assert (join_measured(recording).cycle == -1).all()
 
 
 def test_the_results_are_given_by_windows(run: Run) -> None:
     _, recording, summary = run
-    windows, block = summary.windows, measured(recording)
+    windows, block = summary.windows, join_measured(recording)
     assert [window.index for window in windows] == [0, 1, 2, 3]
     assert all(before.to_s == after.from_s for before, after in pairwise(windows))
     for window in windows:
@@ -216,7 +216,7 @@ def test_a_planted_fault_trips_and_the_table_comes_to_rest(
 def test_a_stop_in_motion_comes_to_rest_smoothly(stop_s: float, tmp_path: Path) -> None:
     config, recording, summary = play_run(tmp_path, NO_CHECK, stop_at=round(stop_s * 2000))
     assert summary.verdict == "stopped"
-    block = measured(recording)
+    block = join_measured(recording)
     command = block.channel("drive_disp_m")
     assert np.abs(command[-500:]).max() < 1e-6
     assert np.abs(np.diff(command)).max() * 2000 < 1.1 * config.margins[-1].velocity_m_s
@@ -255,7 +255,7 @@ def test_blocks_of_another_length_give_the_same_record(tmp_path: Path) -> None:
         more = f"{NO_CHECK}[acquisition]\nblock_samples = {samples}\n"
         _, recording, summary = play_run(folder, more)
         assert summary.verdict == "complete"
-        commands.append(measured(recording).values)
+        commands.append(join_measured(recording).values)
     size = min(values.shape[1] for values in commands)
     assert commands[0][:, :size].tobytes() == commands[1][:, :size].tobytes()
 
@@ -319,7 +319,7 @@ def test_an_acceleration_of_a_mat_file_is_played_and_replayed_from_the_recording
     play_unpaced(config, "record", tmp_path / "run.mcap", lambda: None, lambda _: None)
     (tmp_path / "ground.mat").unlink()
     recording = read_recording(tmp_path / "run.mcap")
-    block = measured(recording)
+    block = join_measured(recording)
     acceleration = np.abs(block.channel("table_acc_m_s2")).max()
     assert acceleration == pytest.approx(0.1 * 9.80665, rel=0.05)
     start = recording.start

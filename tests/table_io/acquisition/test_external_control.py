@@ -84,7 +84,7 @@ def run(
     return Followed(items, drive)
 
 
-def stopped_early(drive: Drive) -> Float1D:
+def stop_early(drive: Drive) -> Float1D:
     """The controller's own stop in the second step: a decay of half a second."""
     values = whole(drive)
     at = next(segment.end for segment in sine_segments(drive) if segment.step == 1) - 300
@@ -166,7 +166,7 @@ def test_trip_is_recorded_while_the_table_goes_on() -> None:
 
 
 def test_controller_that_stops_early_is_recorded_to_rest() -> None:
-    recording = run(setup(), stopped_early)
+    recording = run(setup(), stop_early)
     left = (
         next(s.end for s in sine_segments(recording.drive) if s.step == 1)
         - 300
@@ -232,7 +232,7 @@ def test_stop_ends_the_recording_of_a_moving_table(name: str, verdict: str) -> N
 
 
 def test_stop_that_is_followed_at_the_controller_is_recorded_to_rest() -> None:
-    recording = run(setup(), stopped_early, orders=partial(order, "stop", 500))
+    recording = run(setup(), stop_early, orders=partial(order, "stop", 500))
     left = (
         next(s.end for s in sine_segments(recording.drive) if s.step == 1)
         - 300

@@ -20,7 +20,7 @@ from tests.table_io.acquisition.test_external_control import (
     order,
     run,
     setup,
-    stopped_early,
+    stop_early,
 )
 
 
@@ -60,7 +60,7 @@ def test_stop_in_the_rest_before_the_sweep_does_not_end_a_controller_that_plays_
 
 def test_stop_while_the_drive_is_searched_for_does_not_end_in_motion() -> None:
     asked = round(DRIVE_START_SAMPLE + 2200) // 20
-    recording = run(setup(), stopped_early, orders=partial(order, "stop", asked))
+    recording = run(setup(), stop_early, orders=partial(order, "stop", asked))
     assert recording.event_texts("motion")
     assert recording.stop.states[-1] == "at rest"
     assert recording.block.end > DRIVE_START_SAMPLE + 8000

@@ -124,7 +124,7 @@ def test_dwell_goes_on_without_a_laser() -> None:
 # Track
 
 
-def tracking(by: str, **changes: Any) -> dict[str, Any]:
+def make_track(by: str, **changes: Any) -> dict[str, Any]:
     return {"by": by, "step_hz": 0.05, "resolution_hz": 0.002, **changes}
 
 
@@ -139,7 +139,7 @@ def test_by_phase_the_natural_frequency_is_found_whatever_the_level(level: float
     """u is 90 degrees ahead at the undamped natural frequency: K / M, whatever the damping."""
     errors = itertools.cycle([1 + level, 1 - level, 1.0])
     outcome = play_policy(
-        profile("track", tracking("phase")),
+        profile("track", make_track("phase")),
         lambda step: result(step, linear(step.frequency_hz), level=next(errors)),
     )
     assert at(outcome.conclusion) == pytest.approx(NATURAL_HZ, abs=0.002)
@@ -156,7 +156,7 @@ def test_by_peak_the_maximum_of_u_is_found_below_it(level: float) -> None:
     """|u| is largest at f sqrt(1 - 2 zeta^2); an error of the level does not move it."""
     errors = itertools.cycle([1 + level, 1 - level, 1.0])
     outcome = play_policy(
-        profile("track", tracking("peak", resolution_hz=0.005)),
+        profile("track", make_track("peak", resolution_hz=0.005)),
         lambda step: result(step, linear(step.frequency_hz), level=next(errors)),
     )
     peak = NATURAL_HZ * math.sqrt(1 - 2 * DAMPING_RATIO**2)
@@ -174,13 +174,13 @@ def test_resonance_that_moves_is_followed(by: str, direction: str) -> None:
     """The damper warms up: 1 % of its frequency over 30 visits."""
     played_steps = itertools.count()
 
-    def warming(step: Step) -> StepResult:
+    def warm_up(step: Step) -> StepResult:
         return result(
             step, linear(step.frequency_hz, NATURAL_HZ * (1 - 0.01 * next(played_steps) / 30))
         )
 
-    card = tracking(by, follow=24, resolution_hz=0.005)
-    outcome = play_policy(profile("track", card, directions=[direction]), warming)
+    card = make_track(by, follow=24, resolution_hz=0.005)
+    outcome = play_policy(profile("track", card, directions=[direction]), warm_up)
     last = NATURAL_HZ * (1 - 0.01 * len(outcome.results) / 30)
     if by == "peak":
         last *= math.sqrt(1 - 2 * DAMPING_RATIO**2)
@@ -212,14 +212,14 @@ def test_branch_that_turns_back_is_followed_to_its_phase_without_a_fall() -> Non
         return result(step, upper(step.frequency_hz))
 
     sweep = {"start_hz": 3.0, "stop_hz": 4.4, "step_hz": 0.1}
-    card = tracking("phase", step_hz=0.03, resolution_hz=0.004)
+    card = make_track("phase", step_hz=0.03, resolution_hz=0.004)
     outcome = play_policy(profile("track", card, **sweep), specimen)
     assert not fallen
     assert at(outcome.conclusion) == pytest.approx(FOLD_HZ - 0.0272 * (15.0 / 15.3) ** 2, abs=0.004)
 
 
 def test_fall_off_the_branch_ends_the_search() -> None:
-    card = tracking("phase", phase_deg=70.0, step_hz=0.03, resolution_hz=0.004)
+    card = make_track("phase", phase_deg=70.0, step_hz=0.03, resolution_hz=0.004)
     sweep = {"start_hz": 3.0, "stop_hz": 4.4, "step_hz": 0.1}
     outcome = play_policy(
         profile("track", card, **sweep), lambda step: result(step, upper(step.frequency_hz))
@@ -231,7 +231,7 @@ def test_fall_off_the_branch_ends_the_search() -> None:
 
 @pytest.mark.parametrize("by", ["phase", "peak"])
 def test_no_resonance_in_the_sweep_ends_with_the_sweep(by: str) -> None:
-    test = profile("track", tracking(by), start_hz=2.0, stop_hz=3.0)
+    test = profile("track", make_track(by), start_hz=2.0, stop_hz=3.0)
     outcome = play_policy(test, lambda step: result(step, linear(step.frequency_hz)))
     assert "was not met in the sweep" in outcome.conclusion
     assert len(outcome.results) == 11
@@ -239,15 +239,17 @@ def test_no_resonance_in_the_sweep_ends_with_the_sweep(by: str) -> None:
 
 
 def test_range_is_kept_and_the_visits_are_counted() -> None:
-    test = profile("track", tracking("phase", lowest_hz=1.0, highest_hz=1.25))
+    test = profile("track", make_track("phase", lowest_hz=1.0, highest_hz=1.25))
     outcome = play_policy(test, lambda step: result(step, linear(step.frequency_hz)))
     assert "was not met" in outcome.conclusion
     stiffer = itertools.count()
 
-    def rising(step: Step) -> StepResult:
+    def stiffen(step: Step) -> StepResult:
         return result(step, linear(step.frequency_hz, 1.25 + 0.005 * next(stiffer)))
 
-    outcome = play_policy(profile("track", tracking("phase", highest_hz=1.31, follow=50)), rising)
+    outcome = play_policy(
+        profile("track", make_track("phase", highest_hz=1.31, follow=50)), stiffen
+    )
     assert max(step.frequency_hz for step in outcome.visits) == 1.31
     assert "at 1.31 Hz, the end of the range" in outcome.conclusion
     runs_away = itertools.count()
@@ -255,12 +257,12 @@ def test_range_is_kept_and_the_visits_are_counted() -> None:
     def elusive(step: Step) -> StepResult:
         return result(step, linear(step.frequency_hz, 1.25 + 0.03 * (next(runs_away) % 2)))
 
-    outcome = play_policy(profile("track", tracking("phase", visits=7)), elusive)
+    outcome = play_policy(profile("track", make_track("phase", visits=7)), elusive)
     assert len(outcome.visits) == 7
     assert "not found in 7 visits" in outcome.conclusion
 
 
-@pytest.mark.parametrize("tool, card", [("track", tracking("peak")), ("refine", None)])
+@pytest.mark.parametrize("tool, card", [("track", make_track("peak")), ("refine", None)])
 def test_adaptive_test_without_u_ends(tool: str, card: dict[str, Any] | None) -> None:
     test = profile(tool, card or {"resolution_hz": 0.02, "cycles": 100})
     outcome = play_policy(test, lambda step: result(step, complex("nan"), math.nan))
@@ -337,7 +339,7 @@ class Bistable:
 WIDE: dict[str, Any] = {"start_hz": 2.4, "stop_hz": 4.4, "directions": ["forward", "backward"]}
 
 
-def refining(**changes: Any) -> dict[str, Any]:
+def make_refinement(**changes: Any) -> dict[str, Any]:
     return {"resolution_hz": 0.0125, "cycles": 2000, **changes}
 
 
@@ -360,7 +362,9 @@ def test_every_jump_is_narrowed_in_its_own_direction(
     """Down and up, forward and backward: a hardening specimen, and a softening one."""
     low, high = 2.7912, 4.0274
     specimen = Bistable(low, high) if hardens else Bistable(high, low, hardens=False)
-    test = profile("refine", refining(resolution_hz=resolution_hz), **WIDE | {"step_hz": step_hz})
+    test = profile(
+        "refine", make_refinement(resolution_hz=resolution_hz), **WIDE | {"step_hz": step_hz}
+    )
     outcome = play_policy(test, specimen)
     names = ("down-jump", "up-jump") if hardens else ("up-jump", "down-jump")
     wanted = {f"{names[0]} forward": high, f"{names[1]} backward": low}
@@ -376,7 +380,7 @@ def test_every_jump_is_narrowed_in_its_own_direction(
 def test_after_every_jump_the_branch_is_reached_again_from_where_the_branches_meet() -> None:
     specimen = Bistable(2.7912, 4.0274)
     outcome = play_policy(
-        profile("refine", refining(), **WIDE | {"directions": ["forward"]}), specimen
+        profile("refine", make_refinement(), **WIDE | {"directions": ["forward"]}), specimen
     )
     sizes = [r.swing_m > 3e-3 for r in outcome.results]
     falls = 0
@@ -395,14 +399,14 @@ def test_after_every_jump_the_branch_is_reached_again_from_where_the_branches_me
 def test_approach_hz_shortens_the_way_and_one_inside_the_hysteresis_is_found_out() -> None:
     forward = WIDE | {"directions": ["forward"]}
     short = play_policy(
-        profile("refine", refining(approach_hz=2.7), **forward), Bistable(2.75, 4.0274)
+        profile("refine", make_refinement(approach_hz=2.7), **forward), Bistable(2.75, 4.0274)
     )
-    long = play_policy(profile("refine", refining(), **forward), Bistable(2.75, 4.0274))
+    long = play_policy(profile("refine", make_refinement(), **forward), Bistable(2.75, 4.0274))
     assert intervals(short.conclusion) == intervals(long.conclusion)
     assert len(short.visits) < len(long.visits)
     assert min(step.frequency_hz for step in short.visits) == 2.7
     lost = play_policy(
-        profile("refine", refining(approach_hz=3.4), **forward), Bistable(2.75, 4.0274)
+        profile("refine", make_refinement(approach_hz=3.4), **forward), Bistable(2.75, 4.0274)
     )
     assert "not met again at 3.4 Hz" in lost.conclusion
     assert {step.frequency_hz for step in lost.visits} == {3.4}
@@ -412,8 +416,10 @@ def test_jump_that_comes_late_is_found_earlier_the_longer_a_frequency_is_held() 
     """Slow passage: it leaves two visits after it was due, so the sweep finds it too far on."""
     forward = WIDE | {"directions": ["forward"]}
     specimen = Bistable(2.7912, 3.89, late=2)
-    short = play_policy(profile("refine", refining(), **forward), replace(specimen))
-    long = play_policy(profile("refine", refining(hold_cycles=20), **forward), replace(specimen))
+    short = play_policy(profile("refine", make_refinement(), **forward), replace(specimen))
+    long = play_policy(
+        profile("refine", make_refinement(hold_cycles=20), **forward), replace(specimen)
+    )
     (a, _), (c, d) = (
         intervals(outcome.conclusion)["down-jump forward"] for outcome in (short, long)
     )
@@ -427,7 +433,7 @@ def test_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
     """The first visit after the fold is passed finds the motion half way down."""
     specimen, before = Bistable(2.7912, 4.0274), []
 
-    def falling(step: Step) -> StepResult:
+    def shrink_slowly(step: Step) -> StepResult:
         measured = specimen(step)
         before.append(measured.swing_m)
         if len(before) > 1 and before[-1] < 0.5 * before[-2]:
@@ -435,7 +441,7 @@ def test_jump_that_takes_two_steps_of_the_sweep_is_one() -> None:
         return measured
 
     forward = WIDE | {"directions": ["forward"]}
-    outcome = play_policy(profile("refine", refining(), **forward), falling)
+    outcome = play_policy(profile("refine", make_refinement(), **forward), shrink_slowly)
     assert outcome.conclusion.count("down-jump") == 1
     good, bad = intervals(outcome.conclusion)["down-jump forward"]
     assert good <= 4.0274 <= bad <= good + 0.0125 + 1e-9
@@ -445,7 +451,7 @@ def test_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
     """What was good before is no longer: the interval moves back with it."""
     specimen = Bistable(2.7912, 4.0274)
 
-    def drifting(step: Step) -> StepResult:
+    def drift_down(step: Step) -> StepResult:
         was = specimen.large
         measured = specimen(step)
         if was and not specimen.large:
@@ -453,7 +459,9 @@ def test_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
         return measured
 
     forward = WIDE | {"directions": ["forward"]}
-    outcome = play_policy(profile("refine", refining(resolution_hz=0.004), **forward), drifting)
+    outcome = play_policy(
+        profile("refine", make_refinement(resolution_hz=0.004), **forward), drift_down
+    )
     good, bad = intervals(outcome.conclusion)["down-jump forward"]
     assert bad - good <= 0.004 + 1e-9
     assert good <= specimen.falls_hz + 0.025 <= bad
@@ -461,7 +469,7 @@ def test_fold_that_drifts_under_way_is_found_where_it_is_last() -> None:
 
 @pytest.mark.parametrize("cycles", [5, 60, 150, 400])
 def test_cycles_allowed_are_never_exceeded(cycles: int) -> None:
-    test = profile("refine", refining(cycles=cycles, resolution_hz=0.002), **WIDE)
+    test = profile("refine", make_refinement(cycles=cycles, resolution_hz=0.002), **WIDE)
     outcome = play_policy(test, Bistable(2.7912, 4.0274))
     assert 5 * len(outcome.visits) <= cycles
     assert f"{cycles} cycles do not suffice" in outcome.conclusion
@@ -471,7 +479,7 @@ def test_cycles_allowed_are_never_exceeded(cycles: int) -> None:
 
 
 def test_without_a_jump_there_is_nothing_to_refine() -> None:
-    test = profile("refine", refining(resolution_hz=0.02))
+    test = profile("refine", make_refinement(resolution_hz=0.02))
     outcome = play_policy(test, lambda step: result(step, linear(step.frequency_hz)))
     assert outcome.conclusion == "refine: the sweep found no jump"
     assert len(outcome.results) == 7
@@ -481,7 +489,7 @@ def test_steep_change_is_not_taken_for_a_jump() -> None:
     def steep(step: Step) -> StepResult:
         return result(step, 5e-3 * math.exp(-6.0 * (step.frequency_hz - 3.0)) + 0j)
 
-    test = profile("refine", refining(), **WIDE | {"directions": ["forward"]})
+    test = profile("refine", make_refinement(), **WIDE | {"directions": ["forward"]})
     assert "no jump" in play_policy(test, steep).conclusion
 
 
@@ -567,14 +575,14 @@ class Table:
         return records
 
 
-def dwelling(**control: Any) -> Profile:
+def make_dwell_test(**control: Any) -> Profile:
     test = profile("dwell", {"cycles": 9}, start_hz=3.0, stop_hz=4.0, step_hz=1.0, cycles=3)
     return test.model_copy(update={"control": test.control.model_copy(update=control)})
 
 
 @pytest.mark.parametrize("control", [True, False])
 def test_decided_step_is_announced_before_it_begins(control: bool) -> None:
-    table = Table(start_test(make_test_plan(dwelling(enabled=control), RIG, 40)))
+    table = Table(start_test(make_test_plan(make_dwell_test(enabled=control), RIG, 40)))
     records = table.play(20)
     decided = [record for record in records if isinstance(record, StepAdded)]
     assert [addition.step for addition in decided] == [2, 3, 4]
@@ -600,7 +608,7 @@ def test_decided_step_is_announced_before_it_begins(control: bool) -> None:
 @pytest.mark.parametrize("after", [0, 2000])
 def test_person_may_hold_a_decided_step_and_go_on(after: int) -> None:
     """Also between a decision and its step: the step before is then measured anew."""
-    table = Table(start_test(make_test_plan(dwelling(enabled=False), RIG, 40)))
+    table = Table(start_test(make_test_plan(make_dwell_test(enabled=False), RIG, 40)))
     records: list[Record] = []
     while not [record for record in records if isinstance(record, StepAdded) and record.step == 3]:
         records += table.play(20, until=table.at + 20)

@@ -107,7 +107,7 @@ def clause(check: Clause) -> Clause:
     return check
 
 
-def acquiring(check: Clause) -> Clause:
+def acquisition_clause(check: Clause) -> Clause:
     """A clause that what only acquires keeps as well."""
     ACQUIRING[check.__name__] = check
     return clause(check)
@@ -125,7 +125,7 @@ def require_error(error: type[E], call: Callable[[], object], why: str) -> E:
     raise AssertionError(f"{why}: no {error.__name__}")
 
 
-@acquiring
+@acquisition_clause
 def it_says_what_it_is(bench: Bench) -> None:
     backend = bench.make(RATE_HZ)
     assert backend.channels == bench.rig.channels
@@ -136,7 +136,7 @@ def it_says_what_it_is(bench: Bench) -> None:
     assert backend.replace_after > 0
 
 
-@acquiring
+@acquisition_clause
 def open_refuses_a_rate_that_the_machine_has_not(bench: Bench) -> None:
     backend = bench.make(1234.5)
     error = require_error(InputError, backend.open, "a rate that the machine does not sample at")
@@ -144,7 +144,7 @@ def open_refuses_a_rate_that_the_machine_has_not(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def calls_out_of_order_are_refused(bench: Bench) -> None:
     backend = bench.make(RATE_HZ)
     zero = np.zeros(2)
@@ -170,7 +170,7 @@ def calls_out_of_order_are_refused(bench: Bench) -> None:
         )
 
 
-@acquiring
+@acquisition_clause
 def tare_is_the_inputs_at_rest_and_moves_nothing(bench: Bench) -> None:
     backend = bench.open()
     volts = np.concatenate([backend.tare(400), backend.tare(1), backend.tare(399)], axis=1)
@@ -204,7 +204,7 @@ def sample_0_leaves_when_sample_0_is_taken(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def samples_are_scheduled_at_the_rate(bench: Bench) -> None:
     backend = bench.start_playing(np.zeros(2))
     first = backend.scheduled_time_s(0)
@@ -213,7 +213,7 @@ def samples_are_scheduled_at_the_rate(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def read_waits_for_its_last_sample(bench: Bench) -> None:
     backend = bench.start_playing(np.zeros(2))
     end = 0
@@ -226,7 +226,7 @@ def read_waits_for_its_last_sample(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def how_reads_are_cut_changes_no_sample(bench: Bench) -> None:
     lives = []
     for cuts in ((MOTION_SAMPLES,), (1, 7, 64, 0, MOTION_SAMPLES - 72)):
@@ -335,7 +335,7 @@ def the_last_value_is_held(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
     command = make_bump(1.0, 800)
     backend = bench.start_playing(command)
@@ -348,7 +348,7 @@ def a_lost_sample_is_nan_and_keeps_its_place(bench: Bench) -> None:
     backend.close()
 
 
-@acquiring
+@acquisition_clause
 def close_is_safe_at_any_time(bench: Bench) -> None:
     unopened = bench.make(RATE_HZ)
     unopened.close()
@@ -361,7 +361,7 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
     moving.close()
 
 
-@acquiring
+@acquisition_clause
 def the_next_life_begins_at_rest_at_sample_0(bench: Bench) -> None:
     """Also where the life before was left in motion: open() waits until the machine rests."""
     moving = bench.start_playing(make_bump(1.0, MOTION_SAMPLES))

@@ -81,7 +81,7 @@ def machine() -> Iterator[Served]:
         yield table_server
 
 
-def driving(where: str) -> MachineBackend:
+def start_motion(where: str) -> MachineBackend:
     """A controller whose table moves for a little, to rest."""
     backend = controller(where)
     backend.open()
@@ -118,7 +118,7 @@ def test_other_server_is_refused() -> None:
 
 
 def test_controller_at_a_time(machine: Served) -> None:
-    first = driving(machine.where)
+    first = start_motion(machine.where)
     with raises_input_error(where=machine.where):
         controller(machine.where).open()
     first.read(200)
@@ -128,7 +128,7 @@ def test_controller_at_a_time(machine: Served) -> None:
 def test_machine_that_is_switched_off_ends_at_rest(tmp_path: Path) -> None:
     box = FlightRecorder(tmp_path / "box", print)
     with serve_machine(parse_endpoint(f"unix/{tmp_path / 'table'}"), box) as table_server:
-        backend = driving(table_server.where)
+        backend = start_motion(table_server.where)
     with pytest.raises(MachineLost, match="switched off"):
         backend.read(20000)
     (life,) = read_flight_record(tmp_path / "box")
@@ -147,7 +147,7 @@ def test_machine_that_is_switched_off_ends_at_rest(tmp_path: Path) -> None:
     ],
 )
 def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data: bytes) -> None:
-    backend = driving(machine.where)
+    backend = start_motion(machine.where)
     backend._require_connection().sendall(data)
     with pytest.raises(MachineLost, match="invalid message"):
         backend.read(20000)
@@ -161,7 +161,7 @@ def test_garbage_loses_the_controller_and_not_the_machine(machine: Served, data:
 
 
 def test_received_samples_are_read_before_the_loss(machine: Served) -> None:
-    backend = driving(machine.where)
+    backend = start_motion(machine.where)
     while backend._samples.received < 200:
         backend._receive()
     backend._require_connection().shutdown(socket.SHUT_RDWR)
@@ -176,7 +176,7 @@ def test_received_samples_are_read_before_the_loss(machine: Served) -> None:
 
 
 def test_strangers_at_the_door_do_not_disturb(machine: Served) -> None:
-    backend = driving(machine.where)
+    backend = start_motion(machine.where)
     host, port = "127.0.0.1", int(machine.where.rpartition(":")[2])
     for data in (b"", b"\0" * 5000, encode_message(claim()), b"STM1"):
         with closing(socket.create_connection((host, port))) as stranger:

@@ -329,12 +329,14 @@ def test_samples_behind_a_shorter_command_never_play(
     """Also on a driver that keeps it, and after the rig has died."""
     write = SimulatedDaqDevice.write
 
-    def keeping(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
+    def keep_old_samples(
+        device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float
+    ) -> None:
         end = task.offset + volts.size
         behind = task.volts.values(end, max(task.written, end))
         write(device, task, np.append(volts, behind), now_s)
 
-    monkeypatch.setattr(SimulatedDaqDevice, "write", keeping)
+    monkeypatch.setattr(SimulatedDaqDevice, "write", keep_old_samples)
     bed = Bed(CARD, tmp_path / "box")
     backend = bed.backend()
     backend.open()

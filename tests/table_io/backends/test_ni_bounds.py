@@ -183,10 +183,10 @@ def test_error_before_the_start_is_a_lost_machine(monkeypatch: pytest.MonkeyPatc
     backend = bed.backend()
     backend.open()
 
-    def failing(*_: Any) -> bool:
+    def raise_driver_error(*_: Any) -> bool:
         raise DriverError(-200284)
 
-    monkeypatch.setattr(bed.device, "samples_ready", failing)
+    monkeypatch.setattr(bed.device, "samples_ready", raise_driver_error)
     with pytest.raises(MachineLost, match="-200284"):
         backend.tare(100)
     backend.close()
@@ -195,12 +195,14 @@ def test_error_before_the_start_is_a_lost_machine(monkeypatch: pytest.MonkeyPatc
 def test_driver_that_ignores_a_replacement_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     write = SimulatedDaqDevice.write
 
-    def ignoring(device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float) -> None:
+    def ignore_replacement(
+        device: SimulatedDaqDevice, task: Task, volts: Float1D, now_s: float
+    ) -> None:
         if task.kind == "ao" and task.running and task.offset < task.written:
             return
         write(device, task, volts, now_s)
 
-    monkeypatch.setattr(SimulatedDaqDevice, "write", ignoring)
+    monkeypatch.setattr(SimulatedDaqDevice, "write", ignore_replacement)
     with pytest.raises(InputError) as error:
         Bed().backend().open()
     assert error.value.where.endswith("drive_disp_m")

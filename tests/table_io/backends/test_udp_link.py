@@ -95,7 +95,7 @@ def target() -> Iterator[Served]:
         yield server
 
 
-def driving(address: Address, samples: int = 600) -> UdpBackend:
+def start_motion(address: Address, samples: int = 600) -> UdpBackend:
     """A rig whose table moves for a little, to rest."""
     backend = rig_side(address)
     backend.open()
@@ -169,7 +169,7 @@ def test_sequence_numbers_of_an_old_target_wrap(
             self._sequence = sequence
 
     monkeypatch.setattr("table_io.sim.udp.server.UdpTarget", Old)
-    with serve_target() as server, closing(driving(server.address)) as backend:
+    with serve_target() as server, closing(start_motion(server.address)) as backend:
         volts = np.concatenate([backend.read(100) for _ in range(5)], axis=1)
         backend.queue(1200, np.zeros(10))
     assert np.isfinite(volts).all()
@@ -207,7 +207,7 @@ def test_wiring_that_does_not_fit_is_refused(target: Served, old: str, new: str,
 
 
 def test_rig_at_a_time(target: Served) -> None:
-    first = driving(target.address)
+    first = start_motion(target.address)
     with pytest.raises(InputError, match=REASON_TEXTS[Reason.BUSY]):
         rig_side(target.address).open()
     assert np.isfinite(first.read(1200)).all(), "one that waits is alive"
@@ -220,7 +220,7 @@ def test_port_that_is_taken_is_named(target: Served) -> None:
 
 
 def test_absent_rig_loses_the_target(target: Served) -> None:
-    backend = driving(target.address)
+    backend = start_motion(target.address)
     CLOCK.wait_until(CLOCK.now() + HEARTBEAT_TIMEOUT_S + 0.15)
     with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SILENCE]):
         backend.read(2000)
@@ -235,7 +235,7 @@ def test_absent_rig_loses_the_target(target: Served) -> None:
 
 def test_target_that_is_switched_off_ends_at_rest() -> None:
     with serve_target() as server:
-        backend = driving(server.address)
+        backend = start_motion(server.address)
     with pytest.raises(MachineLost, match=REASON_TEXTS[Reason.SWITCHED_OFF]):
         backend.read(20000)
     assert "at rest" in server.notices[-1]
@@ -251,7 +251,7 @@ class Mute(Relay):
 
 
 def test_dead_target_is_a_lost_machine(target: Served) -> None:
-    with closing(Mute(target.address, 1)) as relay, closing(driving(relay.address)) as backend:
+    with closing(Mute(target.address, 1)) as relay, closing(start_motion(relay.address)) as backend:
         backend.read(80)
         relay.mute = True
         with pytest.raises(MachineLost, match=f"{SAMPLE_TIMEOUT_S:g} s after"):
@@ -272,7 +272,7 @@ class Dropping(Relay):
 def test_samples_that_never_come_are_nan_in_their_place(target: Served) -> None:
     with (
         closing(Dropping(target.address, 1)) as relay,
-        closing(driving(relay.address, 1600)) as backend,
+        closing(start_motion(relay.address, 1600)) as backend,
     ):
         volts = np.concatenate([backend.read(100), backend.read(300), backend.read(100)], axis=1)
         assert CLOCK.now() >= backend.scheduled_time_s(419) + SAMPLE_TIMEOUT_S

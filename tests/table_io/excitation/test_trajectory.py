@@ -29,7 +29,7 @@ ENDS = [
 ]
 
 
-def moving(target: SineTarget, phase: float = 0.0) -> Trajectory:
+def make_trajectory(target: SineTarget, phase: float = 0.0) -> Trajectory:
     return Trajectory(RATE_HZ, 300, target, phase)
 
 
@@ -39,7 +39,7 @@ def test_blend_is_the_shortest_that_keeps_its_peak(
     start: SineTarget, target: SineTarget, min_cycles: float
 ) -> None:
     """Of the lengths that grow by a quarter cycle of the mean frequency."""
-    blended = moving(start, 0.3).append_blend(target, 7, min_cycles, Label.BLEND)
+    blended = make_trajectory(start, 0.3).append_blend(target, 7, min_cycles, Label.BLEND)
     (segment,) = blended.segments
     assert isinstance(segment, Segment)
     # At rest there is no frequency: a blend from or to rest has that of its motion.
@@ -65,11 +65,11 @@ def test_blend_is_the_shortest_that_keeps_its_peak(
 
 
 def test_blend_to_the_same_motion_is_none() -> None:
-    assert moving(SLOW).append_blend(replace(SLOW), 0, 2.0, Label.BLEND).segments == ()
+    assert make_trajectory(SLOW).append_blend(replace(SLOW), 0, 2.0, Label.BLEND).segments == ()
 
 
 def test_hold_keeps_its_target_and_advances_the_phase() -> None:
-    held = moving(SLOW, 0.9).append_hold(430, 3, Label.MEASURE, 4, 1)
+    held = make_trajectory(SLOW, 0.9).append_hold(430, 3, Label.MEASURE, 4, 1)
     assert held.segments == (
         Segment(
             300, 430, Label.MEASURE, 3, 2.0, 2.0, 0.5, 0.5, 0.9, 4, 1, 1.2, 1.2, (0.01j,), (0.01j,)
@@ -93,8 +93,8 @@ def test_rest_and_histories_need_a_table_at_rest() -> None:
     assert len(played.append_history(history_m, 3).segments) == 2
     assert played.to_drive(()).segments == played.segments
     for append in (
-        lambda: moving(SLOW).append_rest(1),
-        lambda: moving(SLOW).append_history(history_m, 1),
+        lambda: make_trajectory(SLOW).append_rest(1),
+        lambda: make_trajectory(SLOW).append_history(history_m, 1),
     ):
         with pytest.raises(ValueError, match="300"):
             append()
@@ -138,7 +138,7 @@ def test_cut_keeps_the_motion_before_it_and_ends_where_it_may() -> None:
     ],
 )
 def test_cut_keeps_a_blend(target: SineTarget) -> None:
-    blended = moving(SLOW).append_blend(target, 0, 2.0, Label.BLEND)
+    blended = make_trajectory(SLOW).append_blend(target, 0, 2.0, Label.BLEND)
     assert blended.cut(350) == blended
 
 
@@ -150,7 +150,7 @@ def test_history_is_not_cut() -> None:
 
 
 def test_drive_ends_with_a_soft_stop_of_its_last_step() -> None:
-    held = moving(FAST).append_hold(500, 6, Label.MEASURE)
+    held = make_trajectory(FAST).append_hold(500, 6, Label.MEASURE)
     steps = (Step(6, "forward", 9.0, 0.4),)
     drive = held.to_drive(steps)
     stop = drive.segments[-1]

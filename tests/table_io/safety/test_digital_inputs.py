@@ -28,7 +28,7 @@ well = { "stroke limit right" = "Dev1/port0/line2" }
 LOOKS, SECONDS = 200, 4.0
 
 
-def beating(hz: float, count: int = LOOKS, well: bool = True) -> list[dict[str, bool]]:
+def make_looks(hz: float, count: int = LOOKS, well: bool = True) -> list[dict[str, bool]]:
     """Looks fifty times a second at a heartbeat, and at a switch."""
     return [{"heartbeat": (2.0 * hz * k / 50.0) % 2.0 >= 1.0, "limit": well} for k in range(count)]
 
@@ -38,26 +38,26 @@ def check_inputs(held: list[dict[str, bool]], after: list[dict[str, bool]]) -> d
 
 
 def test_heartbeat_that_beats_and_stops_passes() -> None:
-    lines = check_inputs(beating(10.0), beating(0.0, 25))
+    lines = check_inputs(make_looks(10.0), make_looks(0.0, 25))
     assert {line.verdict for line in lines.values()} == {"pass"}
     assert lines["heartbeat comes back"].value == pytest.approx(10.0, abs=0.2)
 
 
 @pytest.mark.parametrize("hz", [0.0, 2.0, 20.0])
 def test_heartbeat_of_another_frequency_fails(hz: float) -> None:
-    lines = check_inputs(beating(hz), beating(0.0, 25))
+    lines = check_inputs(make_looks(hz), make_looks(0.0, 25))
     assert lines["heartbeat comes back"].verdict == "fail"
     assert lines["heartbeat comes back"].do
 
 
 def test_heartbeat_without_the_rig_fails() -> None:
-    assert check_inputs(beating(10.0), beating(10.0, 25))["heartbeat stops"].verdict == "fail"
+    assert check_inputs(make_looks(10.0), make_looks(10.0, 25))["heartbeat stops"].verdict == "fail"
 
 
 def test_open_switch_fails_even_once() -> None:
-    held = beating(10.0)
+    held = make_looks(10.0)
     held[77]["limit"] = False
-    line = check_inputs(held, beating(0.0, 25))["all is well"]
+    line = check_inputs(held, make_looks(0.0, 25))["all is well"]
     assert (line.verdict, line.channel) == ("fail", "limit")
 
 

@@ -45,13 +45,13 @@ def lines(values: Float2D, rate: float = RATE, rig: RigConfig = RIG) -> tuple[Ch
     return check_resting_inputs(RestingInputs(rig, rate, values * GAIN))
 
 
-def failing(values: Float2D, rate: float = RATE) -> set[tuple[str, str]]:
+def list_failures(values: Float2D, rate: float = RATE) -> set[tuple[str, str]]:
     return {(line.name, line.channel) for line in lines(values, rate) if line.verdict == "fail"}
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_sound_wiring_passes(seed: int) -> None:
-    assert failing(still(seed=seed)) == set()
+    assert list_failures(still(seed=seed)) == set()
 
 
 def test_every_channel_has_every_line() -> None:
@@ -76,21 +76,21 @@ def spoilt(row: int, values: np.ndarray | float) -> Float2D:
 
 def test_lost_channel_has_no_other_failure() -> None:
     values = spoilt(ACC, np.nan)
-    assert failing(values) == {("lost samples", "table_acc_m_s2")}
+    assert list_failures(values) == {("lost samples", "table_acc_m_s2")}
     assert [line.value for line in lines(values) if line.channel == "table_acc_m_s2"] == [100.0]
     values = still()
     values[CELL, 100] = np.nan
-    assert failing(values) == {("lost samples", "force_l2_n")}
+    assert list_failures(values) == {("lost samples", "force_l2_n")}
 
 
 def test_stuck_channel_from_the_first_sample_or_later() -> None:
-    assert ("stuck", "table_acc_m_s2") in failing(spoilt(ACC, 0.001))
+    assert ("stuck", "table_acc_m_s2") in list_failures(spoilt(ACC, 0.001))
     values = still()
     values[ACC, 5000:] = values[ACC, 4999]
-    assert ("stuck", "table_acc_m_s2") in failing(values)
+    assert ("stuck", "table_acc_m_s2") in list_failures(values)
     values = still()
     values[ACC, 5000:5400] = values[ACC, 4999]  # 0.2 s: a converter may repeat itself so long
-    assert ("stuck", "table_acc_m_s2") not in failing(values)
+    assert ("stuck", "table_acc_m_s2") not in list_failures(values)
 
 
 def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
@@ -108,10 +108,10 @@ def test_noise_below_half_a_step_is_not_taken_for_a_stuck_channel() -> None:
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_channel_at_its_rail(sign: float) -> None:
-    assert ("at the rail", "table_disp_m") in failing(spoilt(LASER, sign * 75.0))
+    assert ("at the rail", "table_disp_m") in list_failures(spoilt(LASER, sign * 75.0))
     values = still()
     values[LASER, 7] = sign * 75.0
-    assert ("at the rail", "table_disp_m") in failing(values)
+    assert ("at the rail", "table_disp_m") in list_failures(values)
 
 
 def test_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
@@ -121,7 +121,7 @@ def test_cable_that_is_off_is_too_quiet_and_a_bad_earth_too_loud() -> None:
     assert results["table_acc_m_s2"].value < results["table_acc_m_s2"].low
     loud = still()
     loud[ACC] += 0.002 * np.random.default_rng(5).standard_normal(SAMPLES)
-    assert failing(loud) == {("noise", "table_acc_m_s2")}
+    assert list_failures(loud) == {("noise", "table_acc_m_s2")}
 
 
 def test_unknown_noise_is_not_tested_and_measured() -> None:
@@ -158,7 +158,7 @@ def test_hum_in_two_channels_is_hum_and_not_one_signal_twice() -> None:
     values = still()
     for row in (CELL, ACC):
         values[row] += 20 * RIG.sensors[row].noise_rms * np.sin(2 * np.pi * 50.02 * TIME)
-    failures = failing(values)
+    failures = list_failures(values)
     assert {channel for name, channel in failures if name == "mains hum"} == {
         "force_l2_n",
         "table_acc_m_s2",
@@ -181,13 +181,15 @@ def test_signal_at_two_inputs(sign: float) -> None:
 
 
 def test_offset_drift_and_spike() -> None:
-    assert failing(still() + np.eye(len(RIG.sensors))[[CELL]].T * 3.0) == {("offset", "force_l2_n")}
+    assert list_failures(still() + np.eye(len(RIG.sensors))[[CELL]].T * 3.0) == {
+        ("offset", "force_l2_n")
+    }
     values = still()
     values[LASER] += 0.1 * TIME
-    assert ("steady", "table_disp_m") in failing(values)
+    assert ("steady", "table_disp_m") in list_failures(values)
     values = still()
     values[ACC, 1234] += 0.01
-    assert failing(values) == {("spikes", "table_acc_m_s2")}
+    assert list_failures(values) == {("spikes", "table_acc_m_s2")}
 
 
 def test_offset_of_the_card_is_where_the_range_begins() -> None:

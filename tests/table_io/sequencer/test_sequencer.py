@@ -73,12 +73,12 @@ def _frequency(drive: Drive, index: int) -> float:
     return segment.f0 + (segment.f1 - segment.f0) * x**3 * (10 - 15 * x + 6 * x * x)
 
 
-def rolled_off(f: Float1D) -> Float1D:
+def roll_off(f: Float1D) -> Float1D:
     """A table that reaches 0.97 at 2 Hz and 0.7 at 4 Hz, without an identified response."""
     return 1.0 / (1.0 + (f / 6.2) ** 2)
 
 
-def play_test(test: Profile, gain: Any = rolled_off, samples: int = 20) -> Table:
+def play_test(test: Profile, gain: Any = roll_off, samples: int = 20) -> Table:
     table = Table(gain, start_test(make_test_plan(test, RIG, 40)))
     table.play(samples)
     return table
@@ -86,7 +86,7 @@ def play_test(test: Profile, gain: Any = rolled_off, samples: int = 20) -> Table
 
 def levels(table: Table, segment: Any) -> Float1D:
     """Amplitude of the table's acceleration in the held cycles of a segment."""
-    return np.array([rolled_off(np.array(segment.f0)) * segment.level0 * segment.correction0])
+    return np.array([roll_off(np.array(segment.f0)) * segment.level0 * segment.correction0])
 
 
 @pytest.mark.parametrize("samples", [1, 7, 64, 500])

@@ -266,7 +266,7 @@ enabled = false
 """
 
 
-def spelt(number: float) -> Iterator[bytes]:
+def spell_number(number: float) -> Iterator[bytes]:
     """How a number could stand in a recording."""
     yield from (form.encode() for form in {str(number), repr(number), f"{number:g}"})
     yield from (struct.pack(order, number) for order in ("<d", ">d"))
@@ -294,6 +294,6 @@ def test_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path) 
     assert stiffness is not None
     sizes = rubber.parameters["force"], rubber.parameters["yield_displacement"]
     for number in (stiffness, *sizes, drift.parameters["rate"]):
-        assert not any(form in held for form in spelt(number)), number
-    assert any(form in held for form in spelt(36000.0))
+        assert not any(form in held for form in spell_number(number)), number
+    assert any(form in held for form in spell_number(36000.0))
     assert keys["truth_sha256"].encode() in held

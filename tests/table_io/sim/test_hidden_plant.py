@@ -103,7 +103,7 @@ class Along:
         self.bumper = (self.push - KJ * self.d - CJ * self.rate) * self.touched
         self.load = balance
 
-    def relaxing(self, path: Float1D, k: float, tau: float) -> Float1D:
+    def integrate_relaxation(self, path: Float1D, k: float, tau: float) -> Float1D:
         """f' = k path' - f / tau along the samples, by the trapezoidal rule."""
         force, out = 0.0, []
         for way in np.diff(path, prepend=path[0]):
@@ -111,7 +111,7 @@ class Along:
             out.append(force)
         return np.array(out)
 
-    def riding(self, mass: float, hz: float, damping_ratio: float) -> Float1D:
+    def integrate_appendage(self, mass: float, hz: float, damping_ratio: float) -> Float1D:
         """Force on the left side of a mass on a spring, along the samples: exact between them."""
         w = 2 * np.pi * hz
         a = np.array([[0.0, 1.0], [-w * w, -2 * damping_ratio * w]])
@@ -124,7 +124,7 @@ class Along:
             stretch = step @ stretch - held * value
         return np.array(out)
 
-    def hysteresis(self, uy: float) -> Float1D:
+    def integrate_hysteresis(self, uy: float) -> Float1D:
         """z of n = 2 with 1/2 and 1/2 along the samples, by small explicit steps."""
         z, out = 0.0, []
         for du in np.diff(self.u, prepend=self.u[0]):
@@ -144,13 +144,13 @@ DOCUMENTED: dict[str, Any] = {
         np.where(abs(a.v) > 5e-3, p["fc"] * np.sign(a.v), a.damper),
         0.0,
     ),
-    "bouc_wen": lambda a, p: (p["force"] * a.hysteresis(p["yield_displacement"]), 0.0),
-    "maxwell_damper": lambda a, p: (a.relaxing(a.u, p["k1"], p["tau"]), 0.0),
+    "bouc_wen": lambda a, p: (p["force"] * a.integrate_hysteresis(p["yield_displacement"]), 0.0),
+    "maxwell_damper": lambda a, p: (a.integrate_relaxation(a.u, p["k1"], p["tau"]), 0.0),
     "bumper_hardening": lambda a, p: (0.0, p["k2"] * a.d * abs(a.d)),
     "hunt_crossley": lambda a, p: (0.0, p["ch"] * abs(a.d) * a.rate),
     "bumper_maxwell": lambda a, p: (
         0.0,
-        np.array([a.relaxing(depth, p["kb"], p["tau"]) for depth in a.depth]),
+        np.array([a.integrate_relaxation(depth, p["kb"], p["tau"]) for depth in a.depth]),
     ),
     "bumper_asymmetry": lambda a, p: (
         0.0,
@@ -172,7 +172,10 @@ DOCUMENTED: dict[str, Any] = {
         np.where(abs(a.u) > 3 * p["width"], -K * np.clip(a.u, -p["width"], p["width"]), a.damper),
         0.0,
     ),
-    "appendage": lambda a, p: (a.riding(p["mass"], p["frequency"], p["damping_ratio"]), 0.0),
+    "appendage": lambda a, p: (
+        a.integrate_appendage(p["mass"], p["frequency"], p["damping_ratio"]),
+        0.0,
+    ),
     "bumper_cubic": lambda a, p: (0.0, p["kc"] * a.d**3),
     "table_tilt": lambda a, p: (M * GRAVITY_M_S2 * p["tilt"] * a.y, 0.0),
     # ratio (C u' + K u + F_R + F_L) = -M a, with the forces themselves as they were.

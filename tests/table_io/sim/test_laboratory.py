@@ -55,7 +55,7 @@ def laboratory(
     return Laboratory(entries, rig, rate, seed, np.random.default_rng([seed, 9]), first)
 
 
-def measured(
+def take_readings(
     *entries: Imperfection, rate: float = RATE_HZ, signals: Float2D | None = None, **values: Float1D
 ) -> Float2D:
     """Readings without noise where the named channels and the signals of the plant are so."""
@@ -330,12 +330,12 @@ def test_filtered_noise_is_stationary_from_the_first_sample() -> None:
 def test_low_cut_forgets_a_step() -> None:
     step = np.ones(4000)
     step[0] = 0.0
-    out = measured(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=step)
+    out = take_readings(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=step)
     t = (np.arange(4000) - 0.5) / RATE_HZ  # a ramp over one sample
     np.testing.assert_allclose(
         out[ROW["mass_acc_m_s2"], 1:], np.exp(-TURN * 0.5 * t[1:]), rtol=1e-6
     )
-    constant = measured(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=np.ones(50))
+    constant = take_readings(imperfection("highpass", corner_hz=0.5), mass_acc_m_s2=np.ones(50))
     np.testing.assert_allclose(constant[ROW["mass_acc_m_s2"]], 0.0, atol=1e-12)
 
 
@@ -345,7 +345,7 @@ def test_bracket_resonates() -> None:
     entry = imperfection("mounting_resonance", frequency=natural, damping_ratio=damping)
     for frequency in (5.0, 300.0, 800.0):
         line = np.sin(TURN * frequency * t)
-        out = measured(entry, rate=rate, mass_acc_m_s2=line)[ROW["mass_acc_m_s2"], 10000:]
+        out = take_readings(entry, rate=rate, mass_acc_m_s2=line)[ROW["mass_acc_m_s2"], 10000:]
         r = frequency / natural
         expected = (1 + 2j * damping * r) / (1 - r**2 + 2j * damping * r)
         response = harmonic(out, frequency, rate) / harmonic(line[10000:], frequency, rate)
@@ -356,7 +356,7 @@ def test_cable_errs_on_impacts_and_forgets() -> None:
     signals = np.zeros((6, 3000))
     signals[4, 1:] = 1000.0
     entry = imperfection("cable", channel="mass_acc_m_s2", error_per_n=1e-4, decay_time=0.2)
-    out = measured(entry, signals=signals)
+    out = take_readings(entry, signals=signals)
     t = (np.arange(3000) - 0.5) / RATE_HZ
     expected = 0.1 * 10 / 9 * (np.exp(-t / 0.2) - np.exp(-10 * t / 0.2))
     np.testing.assert_allclose(out[ROW["mass_acc_m_s2"], 1:], expected[1:], atol=4e-6)
@@ -480,7 +480,7 @@ def test_drift_is_a_line_and_an_exponential_and_a_gain() -> None:
     expected = (2.0 + 0.01 * full_scale) * t / 3600
     expected += (0.5 + 0.001 * full_scale) * (1 - np.exp(-t / 3.0))
     np.testing.assert_allclose(out[ROW["force_r1_n"]], expected, rtol=1e-10, atol=1e-12)
-    gained = measured(entry, mass_disp_m=np.full(count, 7.0))[ROW["mass_disp_m"]]
+    gained = take_readings(entry, mass_disp_m=np.full(count, 7.0))[ROW["mass_disp_m"]]
     np.testing.assert_allclose(gained, 7.0 * (1 + 0.05 * t / 3600), rtol=1e-12)
 
 
@@ -491,7 +491,7 @@ def test_laser_is_not_linear() -> None:
     full_scale = RIG.sensors[ROW["mass_disp_m"]].range_si
     s = np.linspace(-1.2, 1.2, 201)
     entry = imperfection("laser_nonlinearity", share=2e-3, even_share=1e-3)
-    out = measured(entry, mass_disp_m=s * full_scale, mass_acc_m_s2=s)
+    out = take_readings(entry, mass_disp_m=s * full_scale, mass_acc_m_s2=s)
     error = out[ROW["mass_disp_m"]] / full_scale - s
     inside = np.clip(s, -1.0, 1.0)
     chebyshev = np.polynomial.chebyshev.chebval
@@ -505,13 +505,13 @@ def test_laser_is_not_linear() -> None:
 def test_light_spot_reads_the_same_error_at_the_same_place() -> None:
     entry = imperfection("light_spot", rms=3e-6, correlation_length=2e-4)
     x = np.linspace(-0.09, 0.09, 90_001)  # steps of 2 um
-    out = measured(entry, mass_disp_m=x, table_disp_m=x)
+    out = take_readings(entry, mass_disp_m=x, table_disp_m=x)
     error = out[ROW["mass_disp_m"]] - x
     assert error.std() == pytest.approx(3e-6, rel=0.08)
     for steps in (50, 100, 200):  # 0.1, 0.2, 0.4 mm
         correlation = np.mean(error[steps:] * error[:-steps]) / np.mean(error**2)
         assert correlation == pytest.approx(math.exp(-0.5 * (steps / 100) ** 2), abs=0.06)
-    back = measured(entry, mass_disp_m=x[::-1])[ROW["mass_disp_m"]]
+    back = take_readings(entry, mass_disp_m=x[::-1])[ROW["mass_disp_m"]]
     np.testing.assert_array_equal(back[::-1] - x, error)
     other = out[ROW["table_disp_m"], 10_000:-10_000] - x[10_000:-10_000]
     assert abs(np.corrcoef(other, error[10_000:-10_000])[0, 1]) < 0.2
@@ -541,7 +541,7 @@ def test_accelerometers_feel_the_vertical_motion() -> None:
     sine = slice(40_000, None)
 
     def amplitude(*entries: Imperfection) -> complex:
-        out = measured(*entries, rate=rate, signals=signals)[ROW["mass_acc_m_s2"]]
+        out = take_readings(*entries, rate=rate, signals=signals)[ROW["mass_acc_m_s2"]]
         return harmonic(out[sine], frequency, rate) / harmonic(y_acc[sine], frequency, rate)
 
     assert abs(amplitude(cross) / (0.04 * 0.1 * resonance) - 1) < 1e-3
