@@ -132,9 +132,7 @@ applied = [0.0, 1.0]
 """
 
 
-def test_campaign_warns_of_a_new_calibration_record_and_goes_on(
-    tmp_path: Path,
-) -> None:
+def test_campaign_warns_of_a_new_calibration_record_and_goes_on(tmp_path: Path) -> None:
     def plan(rig_toml: str) -> CampaignPlan:
         bundle = SimpleNamespace(profile_toml="p", rig_toml=rig_toml, model_toml="m")
         run = SimpleNamespace(name="01", label="free", bundle=bundle)
@@ -205,10 +203,7 @@ def test_a_table_that_keeps_its_own_time_is_refused_at_full_speed(
 def test_two_campaigns_do_not_work_in_one_folder(folder: Path) -> None:
     Players.ends["free"] = ("aborted", 2)
     run_campaign(make_options(folder))
-    with (
-        hold_lock(folder / "out" / LOCK_FILE),
-        raises_input_error(where=folder / "out"),
-    ):
+    with hold_lock(folder / "out" / LOCK_FILE), raises_input_error(where=folder / "out"):
         run_campaign(make_options(folder, resume=True))
 
 

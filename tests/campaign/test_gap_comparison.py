@@ -261,9 +261,7 @@ def test_records_are_distinguished_by_their_motion(tmp_path: Path) -> None:
     assert len({run.motion for run in listed}) == 4
 
 
-def test_the_terminal_shows_the_table_and_the_best_gaps(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_the_terminal_shows_the_table_and_the_best_gaps(capsys: pytest.CaptureFixture[str]) -> None:
     described = describe_comparison(compare(make_runs()))
     print_gap_comparison(GapResult.model_validate_json(described.to_json()))
     text = " ".join(capsys.readouterr().out.split())

@@ -58,10 +58,7 @@ def make_command(seed: int, seconds: float = 60.0, rms_m: float = 8e-3) -> Float
 
 
 def play_table(
-    command: Float1D,
-    seed: int = 0,
-    friction_m_s2: float = FRICTION_M_S2,
-    noise_m: float = NOISE_M,
+    command: Float1D, seed: int = 0, friction_m_s2: float = FRICTION_M_S2, noise_m: float = NOISE_M
 ) -> Float1D:
     """Return the table's displacement in m: late, and rung by the reversals of its friction."""
     late = np.concatenate([np.zeros(DELAY_SAMPLES), command[:-DELAY_SAMPLES]])
@@ -256,11 +253,7 @@ def test_a_log_that_says_nothing_of_its_table_is_refused(name: str, seed: int) -
 
 @pytest.mark.parametrize(
     ("factor", "offset", "words"),
-    [
-        (-1.0, 0.0, "is reversed"),
-        (1.0 / 9.81, 0.0, r"is 0\.10\d times"),
-        (1.0, None, "is clipped"),
-    ],
+    [(-1.0, 0.0, "is reversed"), (1.0 / 9.81, 0.0, r"is 0\.10\d times"), (1.0, None, "is clipped")],
 )
 def test_a_spoiled_accelerometer_is_refused(
     factor: float, offset: float | None, words: str

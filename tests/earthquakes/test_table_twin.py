@@ -20,10 +20,7 @@ from tests.earthquakes.hydraulic_rig import (
     play,
 )
 from twin.earthquakes.drive_computation import compute_command, compute_correction, measure_error
-from twin.earthquakes.table_identification import (
-    TableIdentification,
-    TableRehearsal,
-)
+from twin.earthquakes.table_identification import TableIdentification, TableRehearsal
 from twin.earthquakes.table_model import TableModel, TableParameters
 
 MASS_KG = TABLE.moving_mass_kg

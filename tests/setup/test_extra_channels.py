@@ -208,8 +208,7 @@ def test_monitor_lists_declared_channels(run: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "channel", "gap"),
-    [("rail", SECOND_ACC, "clipped"), ("nan", TEMPERATURE, "lost")],
+    ("kind", "channel", "gap"), [("rail", SECOND_ACC, "clipped"), ("nan", TEMPERATURE, "lost")]
 )
 def test_fault_of_a_declared_channel_is_recorded(
     tmp_path: Path, kind: str, channel: str, gap: str

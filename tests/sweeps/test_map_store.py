@@ -20,24 +20,13 @@ import pytest
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
 from tests.plugin_package import install_package
-from tests.sweeps.small_study import (
-    STUDY,
-    make_stored_study,
-    read_stored_bytes,
-    write_study,
-)
+from tests.sweeps.small_study import STUDY, make_stored_study, read_stored_bytes, write_study
 from tests.system.clusters import start_cluster, start_quietly
 from twin.api import open_study
 from twin.studies import DEFINITION_FILE, command
 from twin.studies.maps import store, task
-from twin.studies.maps.compute import (
-    compute_chunk,
-    compute_outcomes,
-)
-from twin.studies.maps.store import (
-    MANIFEST_FILE,
-    remove_partial_files,
-)
+from twin.studies.maps.compute import compute_chunk, compute_outcomes
+from twin.studies.maps.store import MANIFEST_FILE, remove_partial_files
 from twin.studies.maps.study import Study
 from twin.studies.maps.task import MapOptions
 from twin.system import grid

@@ -247,11 +247,7 @@ def test_one_model_at_its_gap_is_a_run_as_ever(profile: Path) -> None:
 
 
 def require_refused(
-    profile: Path,
-    models: list[str],
-    gaps: list[str],
-    fields: dict[str, object],
-    **more: Any,
+    profile: Path, models: list[str], gaps: list[str], fields: dict[str, object], **more: Any
 ) -> None:
     out = profile.parent / "out"
     with raises_input_error(**fields):
