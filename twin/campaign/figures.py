@@ -141,11 +141,12 @@ def _draw_levels(campaign: CampaignData) -> CaptionedFigure:
     handles = direction_handles(_dot_style)
     figure.legend(handles=handles, loc="outside upper center", ncols=2)
     return CaptionedFigure(
-        "level", "Level of the table at every measured step",
+        "level",
+        "Level of the table at every measured step",
         "Fundamental of the measured table acceleration over the demanded one, minus one. Green: "
         f"the tolerance of ±{band:g} %.",
         figure,
-    )  # fmt: skip
+    )
 
 
 def _dot_style(direction: str) -> LineStyle:

@@ -98,12 +98,13 @@ def draw_basin_map(basins: Basins, unstable: Float2D | None = None) -> Captioned
     ax.set_title(f"$f$ = {period_map.frequency_hz:.4g} Hz, {_format_gap(basins)}")
     figure.legend(handles=handles, loc="outside lower center", ncols=2)
     return CaptionedFigure(
-        "basin_map", "Basins of attraction",
+        "basin_map",
+        "Basins of attraction",
         f"Attractor to which each of {basins.labels.size} starts settles, at a peak table "
         f"acceleration of {period_map.acceleration_m_s2:.4g} m/s², phase 0, memory relaxed. "
         "Percentages: share of the starts; mm: greatest displacement of the attractor.",
         figure,
-    )  # fmt: skip
+    )
 
 
 def _format_gap(basins: Basins) -> str:

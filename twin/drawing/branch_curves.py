@@ -148,9 +148,10 @@ def describe_bifurcation(bifurcation: Bifurcation) -> str:
                 bifurcation.side, f"the {bifurcation.side} bumper"
             )
             event = (
-                "a contact parts in two on" if bifurcation.guard == "push"
+                "a contact parts in two on"
+                if bifurcation.guard == "push"
                 else "a contact appears or vanishes on"
-            )  # fmt: skip
+            )
             turn = ", and the branch turns back: a jump" if bifurcation.turns_back else ""
             return f"{event} {where}{turn}"
 

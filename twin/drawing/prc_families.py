@@ -211,13 +211,15 @@ def draw_transition(
         case, line_marker = cases[name], "o" if campaign is None else ""
         shade_precompression(panels, _compute_prestress(case), colour, 0.35)
         plot_prc(
-            panels, partial(extract_prc, case.points, "twin"),
+            panels,
+            partial(extract_prc, case.points, "twin"),
             partial(_transition_style, colour, line_marker),
-        )  # fmt: skip
+        )
         plot_prc(
-            panels, partial(extract_prc, measured.get(name, ()), "measured"),
+            panels,
+            partial(extract_prc, measured.get(name, ()), "measured"),
             partial(_filled_style, colour),
-        )  # fmt: skip
+        )
     handles = [
         Line2D([], [], color=colour, lw=1.6, label=format_minus(name))
         for name, colour in colours.items()
@@ -235,7 +237,7 @@ def draw_transition(
         + _compare_g2_g10(cases),
         figure,
         "5",
-    )  # fmt: skip
+    )
 
 
 def _transition_style(colour: str, marker: str, direction: str) -> LineStyle:

@@ -164,7 +164,7 @@ def decode_rig_packet(data: bytes) -> RigPacket | None:
     values = np.frombuffer(data, "<f8", count, RIG_HEADER.size)
     return RigPacket(
         PacketKind(kind), session, sequence, index, queue, piece, samples, first, last, values
-    )  # fmt: skip
+    )
 
 
 def encode_target_state(state: TargetState) -> bytes:

@@ -84,9 +84,7 @@ def test_latency_of_the_feedback_is_stated(held: PlayedSession) -> None:
 
 
 def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
-    plant = Plant(
-        550.0, 36e3, 1100.0, 510e3, 900.0, 2e-3, 2e-3, 2000.0, 20.0, 0.0, True, RATE_HZ
-    )  # fmt: skip
+    plant = Plant(550.0, 36e3, 1100.0, 510e3, 900.0, 2e-3, 2e-3, 2000.0, 20.0, 0.0, True, RATE_HZ)
     orbits = trace_orbits(plant, 0.05 * 9.80665, 2.2e-3, 2.46e-3, start_hz=3.0)
     by_shooting = [(o.frequency_hz, 1e3 * o.fundamental_m, abs(o.multiplier)) for o in orbits]
     frequencies_hz, amplitudes_mm, multipliers = np.array(by_shooting).T

@@ -48,7 +48,7 @@ I64 = st.integers(-(2**63), 2**63 - 1)
 VOLTS = st.lists(st.floats(width=64), max_size=VALUES_PER_PACKET).map(np.array)
 WORDS = st.builds(
     RigPacket, st.sampled_from(PacketKind), U64, U32, I64, U32, U32, U32, I64, I64, VOLTS
-)  # fmt: skip
+)
 STATES = st.builds(
     TargetState, st.sampled_from(Phase), st.sampled_from(Reason), U64, U32, I64, I64, I64, U32,
     st.sampled_from(QueueVerdict), U32, U32, U32, U32, st.floats(allow_nan=False),

@@ -164,11 +164,10 @@ def test_file_too_large_to_travel_with_the_profile_is_refused(tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('[excitation]\nkind = "record"\nfile = "motion.csv"',
-         '[x]\n', csv()),
+        ('[excitation]\nkind = "record"\nfile = "motion.csv"', "[x]\n", csv()),
         ("", "", csv() + "# '''"),
     ],
-)  # fmt: skip
+)
 def test_file_that_cannot_be_attached_is_refused(
     old: str, new: str, text: str, tmp_path: Path
 ) -> None:

@@ -106,9 +106,10 @@ class StudyConfig(ConfigModel):
     model: str = Field("", description="Name or path of a model; empty: the one of the test.")
     outcomes: tuple[str, ...] = Field(min_length=1, description="What is computed of every case.")
     sampling: Sampling = Field(
-        "grid", description="All combinations of the values, or samples between their ends; "
-        "sensitivity: those that Sobol indices need."
-    )  # fmt: skip
+        "grid",
+        description="All combinations of the values, or samples between their ends; "
+        "sensitivity: those that Sobol indices need.",
+    )
     samples: Count | None = Field(
         None, ge=2, le=MAX_CASES,
         description="Number of samples, of sobol and sensitivity a power of 2; of sensitivity, "
