@@ -23,6 +23,7 @@ from table_io.formats.strong_motion import (
     is_volume_2,
     parse_knet,
     parse_peer,
+    parse_smc,
     parse_volume_2,
 )
 from table_io.formats.table import ForeignTable
@@ -149,11 +150,7 @@ def _parse_lines(file: TextIO, path: Path) -> ForeignTable:
     first = file.readline(SNIFF_BYTES)
     file.seek(0)
     if SMC_WORDS.match(first):
-        raise InputError(
-            "an SMC record of USGS, a format that is not read",
-            where=path,
-            remedy="get the record as V2 or AT2, or export it as CSV",
-        )
+        return parse_smc(file, path)
     if first.startswith(KNET_WORDS):
         return parse_knet(file, path)
     if path.suffix.lower() in PEER_SUFFIXES:

@@ -19,6 +19,7 @@ from table_io.formats.layout import (
     is_number,
     parse_number,
     start_at_zero,
+    strip_cells,
 )
 from table_io.formats.table import ForeignTable, make_column
 
@@ -101,6 +102,8 @@ def read_cells(
         try:
             reader.add_row(number, cells)
         except InputError:
+            if strip_cells(cells) in layout.head:
+                continue  # counted below, as lines that hold no samples
             rest = ((number, cells), *rows) if _is_remark(cells, layout.width) else ()
             if not rest or not all(_is_remark(others, layout.width) for _, others in rest):
                 raise

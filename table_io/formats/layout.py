@@ -21,6 +21,8 @@ CONVERTED_MARK = "# variable "  # begins the remark above the columns of a conve
 MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which cells are text
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 FORTRAN = re.compile(r"\s*[-+]?\d*\.?\d*[dD][-+]?\d+\s*")
+# With marks of thousands that cannot be decimal commas: 1,234.5 and 1'234.
+THOUSANDS = re.compile(r"\s*[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:'\d{3})+(?:\.\d*)?)\s*")
 ROW_WORDS = ("TS", "RN")  # units of a time stamp and of a row number, in loggers of Campbell
 # Line below the units of those loggers: how the samples of a column were reduced.
 REDUCTIONS = {"", "Smp", "Avg", "Tot", "Max", "Min", "Std"}
@@ -39,7 +41,7 @@ class TableLayout:
     """Names and stated units of the columns, index of the first row of samples, stated facts.
 
     `names` is empty if the file has none; `spare` are names beyond the last column. `kinds` are
-    those of the cells, by `_find_kind`.
+    those of the cells, by `_find_kind`. `head`: the cells of the rows above the samples.
     """
 
     names: tuple[str, ...]
@@ -50,6 +52,7 @@ class TableLayout:
     spare: tuple[str, ...] = ()
     samples: int = 0  # rows of samples among the first ones
     facts: dict[str, float] = field(default_factory=dict)
+    head: frozenset[tuple[str, ...]] = frozenset()
 
     @property
     def width(self) -> int:
@@ -93,7 +96,8 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
     facts = read_facts(remarks)
     samples = sum(_is_alike(kinds[k].ljust(len(kind)), kind) for k in filled[first:])
     spare = names[len(kind) :]
-    return TableLayout(names[: len(kind)], units, index, kind, commas, spare, samples, facts)
+    head = frozenset(map(strip_cells, rows[:index]))
+    return TableLayout(names[: len(kind)], units, index, kind, commas, spare, samples, facts, head)
 
 
 def _find_numbers(
@@ -149,11 +153,21 @@ def _find_names(
     if not names:
         return (), units, above
     rest = above[:place]
-    if all(not n or is_unit(n) or n in ROW_WORDS for n in names) and any(map(is_unit, names)):
+    other = _fit_names(rows[rest[-1]], width) if rest else ()
+    if _are_units(names):
         units = tuple(normalize_unit(name) for name in names[:width])
-        names = _fit_names(rows[rest[-1]], width) if rest else ()
-        rest = rest[:-1] if names else rest
-    return names, units, rest
+        names = other
+    elif _are_units(other):  # above the names
+        units = tuple(normalize_unit(name) for name in other[:width])
+    else:
+        return names, units, rest
+    return names, units, rest[:-1] if other else rest
+
+
+def _are_units(names: Sequence[str]) -> bool:
+    return any(map(is_unit, names)) and all(
+        not name or is_unit(name) or name in ROW_WORDS for name in names
+    )
 
 
 def _is_remark(row: Sequence[str]) -> bool:
@@ -185,6 +199,11 @@ def _fit_names(row: Sequence[str], width: int) -> tuple[str, ...]:
     return tuple(cells) if len(cells) == width or is_spare else ()
 
 
+def strip_cells(row: Sequence[str]) -> tuple[str, ...]:
+    """Return the cells of a row without blanks, by which a head that is repeated is known."""
+    return tuple(cell.strip() for cell in _strip_end(row))
+
+
 def _strip_end(row: Sequence[str]) -> Sequence[str]:
     """Return the row without one empty cell at its end, the mark of a trailing delimiter."""
     return row[:-1] if len(row) > 1 and not row[-1].strip() else row
@@ -210,13 +229,15 @@ def is_number(cell: str) -> bool:
 
 
 def parse_number(cell: str) -> float:
-    """Return the number of a cell, also with an exponent of Fortran (1.0D-03); else ValueError."""
+    """Return the number of a cell, also 1.0D-03 of Fortran and 1,234.5; else ValueError."""
     try:
         return float(cell)
     except ValueError:
-        if not FORTRAN.fullmatch(cell):
-            raise
-        return float(cell.upper().replace("D", "E"))
+        if FORTRAN.fullmatch(cell):
+            return float(cell.upper().replace("D", "E"))
+        if THOUSANDS.fullmatch(cell):
+            return float(re.sub("[,']", "", cell))
+        raise
 
 
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
@@ -234,6 +255,7 @@ class ClockReader:
 
     def __init__(self) -> None:
         self._first_day: int | None = None
+        self._is_day_first = False  # of dates with slashes, once one of them tells
 
     def __call__(self, cell: str) -> float:
         """Return the time of a cell in s; NaN if it is empty, ValueError if it is no time."""
@@ -255,9 +277,13 @@ class ClockReader:
             time_s += ahead_s if zone[0] == "-" else -ahead_s
         if not first:
             return time_s
-        year, month, day = int(first), int(second), int(third)
+        parts = int(first), int(second), int(third)
+        year, month, day = parts
         if len(first) < 3:
-            year, month, day = (day, month, year) if mark == "." else (day, year, month)
+            day, month, year = parts
+            self._is_day_first |= mark == "." or day > 12
+            if not self._is_day_first:
+                day, month = month, day
         number = int(np.datetime64(f"{year:04d}-{month:02d}-{day:02d}").astype(int))
         self._first_day = number if self._first_day is None else self._first_day
         return time_s + DAY_S * (number - self._first_day)

@@ -98,6 +98,7 @@ def _read_segment(
     part = read_cells(path, KIND, layout, ((n, row) for n, row in samples if any(row)))
     channels = [name for name in names if not name.startswith(CLOCK)]
     columns: Columns = {}
+    starts_s: list[float] = []
     for k, name in enumerate(channels):
         if name not in part.columns:  # no numbers, or two channels of this name
             continue
@@ -109,10 +110,17 @@ def _read_segment(
         start_s, interval_s = (
             float(text) if is_number(text) else 0.0 for text in (start_text, interval_text)
         )
-        clock = f"{CLOCK} of {name}" if x_columns == "Multi" else CLOCK
-        values, times = part.read_column(name)[:size], part.read_column(clock)[:size]
+        clock = f"{CLOCK} of {name}"
+        values = part.read_column(name)[:size]
         if x_columns == "No":
             times = np.asarray(start_s + interval_s * np.arange(values.size), dtype=np.float64)
+        else:
+            times = part.read_column(clock if x_columns == "Multi" else CLOCK)[:size]
+        starts_s.append(start_s)
+        if x_columns == "One":  # the column is that of the first channel
+            times = times + (start_s - starts_s[0])
+        if x_columns != "Multi" and len({*starts_s}) == 1:
+            clock = CLOCK
         columns.setdefault(clock, make_column(times, "s", 0))
         rate_hz = 1.0 / interval_s if interval_s > 0 else None
         columns[name] = ForeignColumn(

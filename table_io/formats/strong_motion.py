@@ -1,10 +1,11 @@
-"""Readers of strong-motion records in text: PEER AT2 and DT2, CSMIP and COSMOS Volume 2, K-NET.
+"""Readers of strong-motion records: PEER AT2 and DT2, CSMIP and COSMOS Volume 2, K-NET, SMC.
 
 ESM, ITACA and others whose header lines are `KEY: value` are text tables of one column (`text`).
 Sources: https://ngawest2.berkeley.edu, format of .AT2 and .DT2, old and new headers; California
 Strong Motion Instrumentation Program, Report OSMS 85-03 (line "points of accel data equally spaced
 at"); K-NET ASCII format (https://www.kyoshin.bosai.go.jp); Strong-motion data format of COSMOS,
-V1.20 (line "acceleration pts", time step in entry 34 of the real header).
+V1.20 (line "acceleration pts", time step in entry 34 of the real header); USGS Open-File Report
+92-296A, format SMC (11 lines of text, 48 integers, 50 real numbers, remarks, samples).
 """
 
 import math
@@ -24,7 +25,13 @@ PEER_SUFFIXES = (".at2", ".dt2", ".vt2")
 PEER_KIND, VOLUME_2_KIND = "a PEER record", "a CSMIP or COSMOS V2 record"
 KNET_KIND = "a K-NET record"
 KNET_WORDS = "Origin Time"
-SMC_WORDS = re.compile(r"\s*[12] (?:un)?corrected (?:accelerogram|velocity|displacement)", re.I)
+SMC_KIND = "an SMC record of USGS"
+SMC_WORDS = re.compile(
+    r"\s*([1-4]) (?:(?:un)?corrected )?(accelerogram|velocity|displacement)", re.I
+)
+SMC_UNITS = {"accelerogram": "cm/s2", "displacement": "cm"}
+SMC_HEADERS = ((11, 6, 10), (17, 10, 15))  # lines before, lines, width: integers, real numbers
+SMC_WIDTH = 10  # of a sample
 HISTORY_UNITS = ("g", "cm/s2", "m/s2", "mm/s2", "cm", "mm", "m")
 MAX_HEADER_CHARS = 200  # of a line, in which a header is looked for
 COSMOS_STEP_ENTRY = 34  # of the real header: time between samples in s
@@ -94,6 +101,29 @@ def parse_knet(file: TextIO, path: Path) -> ForeignTable:
     )
 
 
+def parse_smc(file: TextIO, path: Path) -> ForeignTable:
+    """Read a record of the strong-motion CDs of USGS: fixed columns, headers without names."""
+    lines = file.read().splitlines()
+    quantity = (SMC_WORDS.match(lines[0]) or [""] * 3)[2].lower()
+    integers, numbers = (
+        [
+            float(word) if is_number(word) else math.nan
+            for line in lines[before : before + count]
+            for word in _make_splitter(width)(line)
+        ]
+        for before, count, width in SMC_HEADERS
+    )
+    if len(integers) < 17 or len(numbers) < 2 or not math.isfinite(integers[15] + integers[16]):
+        raise InputError(f"{SMC_KIND} whose header is cut off", where=path, remedy="get it whole")
+    unit = _read_unit(SMC_UNITS.get(quantity, quantity), f"{path}")
+    first = sum(SMC_HEADERS[1][:2]) + int(integers[15])  # below as many remarks
+    values = _parse_words(lines[first:], path, first + 1, _make_splitter(SMC_WIDTH))
+    _check_count(f"{path}", int(integers[16]), len(values))
+    step_s = _parse_step(f"{1.0 / numbers[1] if numbers[1] else math.nan}", f"{path}: row 18")
+    history = _make_history(values, unit, step_s, 1)
+    return ForeignTable(path, SMC_KIND, {"history": history}, first_row=first + 1)
+
+
 def parse_volume_2(file: TextIO, path: Path) -> ForeignTable:
     """Read the accelerations of all channels of a corrected accelerogram, as `channel 1`, ..."""
     lines = file.read().splitlines()
@@ -114,7 +144,7 @@ def parse_volume_2(file: TextIO, path: Path) -> ForeignTable:
         for row, line in enumerate(lines[at + 1 :], at + 2):
             if len(values) >= count or line.lower().startswith(BLOCK_ENDS):
                 break
-            values += _parse_words([line], path, row, _make_splitter(width))
+            values += _parse_words([line], path, row, _make_splitter(int(width[1]) if width else 0))
         _check_count(place, count, len(values))
         table.columns[f"channel {number}"] = _make_history(values, unit, step_s, number)
     if not table.columns:
@@ -140,12 +170,11 @@ def _make_history(values: list[float], unit: str, step_s: float, number: int) ->
     return ForeignColumn(history.size, (number,), unit, 1.0 / step_s, values=history)
 
 
-def _make_splitter(width: re.Match[str] | None) -> Callable[[str], list[str]]:
-    """Return the function that cuts a line into numbers: by width, since they may touch."""
-    if width is None:
+def _make_splitter(width: int) -> Callable[[str], list[str]]:
+    """Return the function that cuts a line into numbers: by width, since they may touch; or 0."""
+    if not width:
         return str.split
-    size = int(width[1])
-    return lambda line: [line[k : k + size] for k in range(0, len(line.rstrip()), size)]
+    return lambda line: [line[k : k + width] for k in range(0, len(line.rstrip()), width)]
 
 
 def _find_cosmos_step(lines: list[str], path: Path) -> str:
@@ -155,7 +184,7 @@ def _find_cosmos_step(lines: list[str], path: Path) -> str:
     if not headers:
         raise InputError(f"{VOLUME_2_KIND} without a real header of the time step", where=path)
     at, match = headers[-1]
-    split = _make_splitter(re.match(r"\D*(\d+)", match[2]))
+    split = _make_splitter(int(match[2]))
     cells = [cell for line in lines[at + 1 : at + 1 + int(match[1])] for cell in split(line)]
     return cells[COSMOS_STEP_ENTRY - 1] if len(cells) >= COSMOS_STEP_ENTRY else ""
 

@@ -1,6 +1,6 @@
 """Text tables of numbers: their encoding, delimiter and rows; and their writer.
 
-The delimiter is a comma, a semicolon, a tab or blanks; the samples may be preceded by remarks, a
+A comma, a semicolon, a tab, a bar or blanks separate cells; samples may be preceded by remarks, a
 row of names and a row of units (`layout`), and followed by remarks. Lines that begin with # or %
 and empty lines are no samples.
 """
@@ -20,7 +20,7 @@ from table_io.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout, is_
 from table_io.formats.table import ForeignTable, TableColumns
 
 BLANKS = " "  # one or more of them, or tabs
-DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", BLANKS: "blanks"}
+DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 MAX_LINE_CHARS = 1_000_000
 
 

@@ -122,8 +122,9 @@ def judge_time_unit(table: ForeignTable, name: str, stated_hz: float | None = No
             whose = "stated" if stated_hz else "of the file"
             return TimeUnit(unit, f"agrees with the {known_hz:g} Hz {whose}")
     is_count = step == 1.0 and bool((times == np.rint(times)).all())
-    if is_count and stated_hz:
-        return TimeUnit(SAMPLE_UNIT, f"counts samples, at the stated {stated_hz:g} Hz")
+    if is_count and known_hz:
+        whose = "stated" if stated_hz else "file's"
+        return TimeUnit(SAMPLE_UNIT, f"counts samples, at the {whose} {known_hz:g} Hz")
     for unit, date in _find_dates(float(times[0])).items():
         if MIN_PLAIN_RATE_HZ <= rates.get(unit, 0.0) <= MAX_RATE_HZ:
             since = "1899-12-30" if unit == "day" else "1970"

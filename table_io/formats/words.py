@@ -29,7 +29,8 @@ MASS_UNITS_KG = {"kg": 1.0, "t": 1e3, "ton": 1e3, "tons": 1e3, "tonnes": 1e3, "l
 FACT_NAMES = {
     "rate_hz": (r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"),
     "interval_s": (
-        r"(?:sampling|sample|time)[ _]*(?:interval|period|step|increment)(?:_s)?|dt|ts|delta_?t"
+        r"(?:sampling|sample|scan|time)[ _]*(?:interval|period|step|increment)(?:_s)?|dt|ts"
+        r"|delta_?t"
     ),
     "mass_kg": r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg",
 }

@@ -195,6 +195,19 @@ GOOD: dict[str, str | bytes] = {
     "us_date.csv": with_stamps(
         "Time,Disp (mm),Force (N)", lambda d, k: f"{d:%m/%d/%Y %I:%M:%S.%f %p}"
     ),
+    "day_first.csv": with_stamps(
+        "Time,Disp (mm),Force (N)", lambda d, k: f"{d:%d/%m/%Y %H:%M:%S.%f}"
+    ),
+    "bars.txt": text("Time (s)|Disp (mm)|Force (N)", mark="|"),
+    "units_above_names.csv": text("s;mm;N\nTime;Disp;Force", mark=";"),
+    "repeated_head.csv": "".join(
+        ("Time,Disp,Force\ns,mm,N\n" if k % 100 == 0 else "") + f"{t:.4f},{u:.7f},{f:.7f}\n"
+        for k, (t, u, f) in enumerate(ROWS)
+    ),
+    "thousands.csv": "\n".join(
+        ["Time (s),Disp (µm),Force (N)"] + [f'{t:.4f},"{1e3 * u:,.4f}",{f:.7f}' for t, u, f in ROWS]
+    ),
+    "numbered.csv": with_times("Scan interval: 5 ms\nSample,Disp (mm),Force (N)", COUNTS),
     "minutes_seconds.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d:%M:%S.%f}"),
     "no_times.csv": text(
         "Sampling rate: 200 Hz\nDisp (mm),Force (N)", ((u, f) for _, u, f in ROWS)
@@ -261,7 +274,10 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     ),
     "reversed.csv": (with_scales("Time (s),Disp (mm),Force (N)", 1.0, -1.0), "reversed"),
     "metres.csv": (with_scales("Time (s),Disp (m),Force (N)", 35.0, 1.0), "m"),
-    "smc.smc": ("2 CORRECTED ACCELEROGRAM\n" + "1 2 3\n" * 40, "SMC"),
+    "smc.smc": ("2 CORRECTED ACCELEROGRAM\n" + "1 2 3\n" * 40, "SMC record of USGS whose"),
+    "starts.lvm": (
+        lvm("No").replace("X0\t0.0000000E+00\t0.0", "X0\t0.0000000E+00\t2.5", 1), "2.5 s apart"
+    ),
     "empty.lvm": ("LabVIEW Measurement\t\nWriter_Version\t2\n***End_of_Header***\n", "no segment"),
     "not.tdms": (b"hello" * 30, "not a LabVIEW TDMS file"),
     "not.parquet": (b"hello" * 30, "not a Parquet file"),

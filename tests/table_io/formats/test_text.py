@@ -136,7 +136,7 @@ def test_rows_between_which_lines_are_left_out_keep_their_numbers(tmp_path: Path
         ("a,b\n1,2\nend\n3,4\n", ["row 3 has 1 cells"]),
         ('a,b\n1,"2\n' + "3,4\n" * 50_000, ["row 2", "quote"]),
         ("a,b\n" + "1" * (MAX_LINE_CHARS + 5), ["line of more than"]),
-        ("2 CORRECTED ACCELEROGRAM  X\n1 2\n", ["an SMC record of USGS", "as V2 or AT2"]),
+        ("2 CORRECTED ACCELEROGRAM  X\n1 2\n", ["an SMC record of USGS", "header is cut off"]),
         ("LabVIEW Measurement\t\nSeparator\tTab\n", ["a LabVIEW measurement file", "no segment"]),
     ],
 )
@@ -235,3 +235,25 @@ def test_read_table_of_a_file_that_is_not_there(tmp_path: Path) -> None:
         read_table(tmp_path / "none.csv")
     with raises_input_error(where=tmp_path, problem=os.strerror(errno.EISDIR)):
         read_table(tmp_path)
+
+
+def test_record_of_usgs_in_fixed_columns(tmp_path: Path) -> None:
+    """Samples of ten columns touch, and the headers have numbers without names."""
+    values = [-1.2345e2, 2.5e-1, -9.9999e1] * 5
+    integers = ["-32768"] * 15 + ["2", "15"] + ["0"] * 31
+    numbers = ["1.7e38", "2.0e2"] + ["0.0"] * 48
+    lines = ["2 CORRECTED ACCELEROGRAM", *["*"] * 10]
+    for words, count, width in ((integers, 8, 10), (numbers, 5, 15)):
+        rows = (words[k : k + count] for k in range(0, len(words), count))
+        lines += ["".join(word.rjust(width) for word in row) for row in rows]
+    cells = [f"{value:10.3E}".rjust(10) for value in values]
+    lines += ["| a remark", "| and one more"]
+    lines += ["".join(cells[k : k + 8]) for k in range(0, len(cells), 8)]
+    (tmp_path / "a.smc").write_text("\n".join(lines) + "\n")
+    history = read_table(tmp_path / "a.smc").columns["history"]
+    assert history.values is not None
+    assert history.values.tolist() == [float(cell) for cell in cells]
+    assert (history.unit, history.rate_hz) == ("cm/s2", 200.0)
+    (tmp_path / "cut.smc").write_text("\n".join(lines[:-1]) + "\n")
+    with raises_input_error(problem="15 samples, but 8 follow"):
+        read_table(tmp_path / "cut.smc")
