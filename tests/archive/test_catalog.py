@@ -21,6 +21,7 @@ from twin.archive.notes import note_run
 from twin.archive.query import index_runs, select_by_comparisons
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_start
+from twin.report.run_index import find_run_folders
 
 PROFILES = Path(__file__).parents[2] / "profiles"
 
@@ -127,6 +128,27 @@ def test_only_what_changed_is_read_again(archive: Path, monkeypatch: pytest.Monk
     assert [row.values["stiffness"] for row in after.runs if row.values] == [1e3, 36002, 36001]
     assert after.runs[1].note == "noted since"
     assert after.runs[2].values == before.runs[2].values
+
+
+def test_runs_and_single_logs_are_the_same_with_and_without_a_catalogue(archive: Path) -> None:
+    """At any depth, and with a catalogue that is damaged."""
+    pytest.importorskip("duckdb")
+    shutil.move(archive / "run0", archive / "year/month/week/run0")
+    for name in ("imported.mcap", ".trash/run.mcap"):
+        (archive / name).parent.mkdir(exist_ok=True)
+        shutil.copy(archive / "run2/run.mcap", archive / name)
+    (archive / "run2/run.foxglove.mcap").write_bytes(b"an export")
+    rows = index_runs(archive)
+    names = ["run3", "run2", "run1", "run0", "imported.mcap"]
+    assert list_names(rows) == names
+    assert [row.problem for row in rows] == [None] * 5
+    (single,) = (row for row in rows if row.folder == "imported.mcap")
+    assert (single.gap_mm, single.verdict, single.rig) == (10.0, None, "simulated")
+    update_catalog([archive])
+    assert list_names(index_runs(archive)) == names
+    assert find_run_folders(archive) == [archive / row.folder for row in rows[:-1]]
+    (archive / "catalog/runs.parquet").write_bytes(b"PAR1 and no more")
+    assert list_names(index_runs(archive, "gap_mm = 10")) == ["run2", "imported.mcap"]
 
 
 def test_a_recording_that_is_cut_off_is_a_problem(archive: Path) -> None:

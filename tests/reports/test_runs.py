@@ -67,9 +67,9 @@ def in_root(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_runs_are_listed_newest_first_with_what_their_summary_states(root: Path) -> None:
     rows = index_runs(root)
-    assert [row.folder for row in rows] == ["runs/campaign/g4", "runs/after", "before"]
-    newest, after, before = rows
-    assert (newest.verdict, newest.twin_verdict, newest.nrmse) == (None, None, None)
+    assert [row.folder for row in rows] == ["runs/after", "before", "runs/campaign/g4"]
+    after, before, last = rows
+    assert (last.verdict, last.twin_verdict, last.nrmse) == (None, None, None)
     assert (before.verdict, before.twin_verdict, before.misfit) == ("complete", "agrees", 1.0)
     assert (after.twin_verdict, after.warnings, after.gap_m) == ("departs", 1, 0.004)
     assert before.nrmse == 0.0512
@@ -83,7 +83,7 @@ def test_hidden_folders_hold_no_runs(root: Path, tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("in_root")
 def test_last_is_the_newest_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert parse_run_path("last") == Path("runs/campaign/g4")
+    assert parse_run_path("last") == Path("runs/after")
     assert parse_run_path("before") == Path("before")
     monkeypatch.chdir(tmp_path)
     with raises_input_error(key="last", where=tmp_path):
@@ -120,13 +120,13 @@ def test_the_last_measured_run_is_no_simulation(tmp_path: Path) -> None:
 
 def test_last_works_on_the_command_line(root: Path) -> None:
     result = call_main("verify", "last", "--json", cwd=root)
-    assert json.loads(result.stdout)["log"] == ["runs/campaign/g4/run.mcap"]
+    assert json.loads(result.stdout)["log"] == ["runs/after/run.mcap"]
 
 
 def test_the_command_prints_json_and_writes_an_index(root: Path, tmp_path: Path) -> None:
     page = tmp_path / "index.html"
     result = call_main("runs", root, "--json", "--page", page)
-    assert [row["folder"] for row in json.loads(result.stdout)["runs"]][-1] == "before"
+    assert [row["folder"] for row in json.loads(result.stdout)["runs"]][-2] == "before"
     assert page.read_text().count("<tr data-row=") == 3
     assert call_main("runs", root, "--page", page).returncode == 0, "an index is replaced"
 

@@ -6,7 +6,8 @@ then decide whether its rows are made again.
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,7 +24,8 @@ from twin.archive.run_row import (
     replace_nonfinite,
 )
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.report.run_index import find_run_folders, order_by_start
+from twin.report.run_index import LOG_NAME, iter_runs, order_by_start
+from twin.system.terminal import error_console
 
 if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection, DuckDBPyRelation  # of the extra `archive`
@@ -31,8 +33,7 @@ if TYPE_CHECKING:
 CATALOG_FOLDER = "catalog"
 RUNS_FILE, STEPS_FILE = "runs.parquet", "steps.parquet"
 EXTRA = "archive"
-LAYOUT = "1"  # of the rows: a catalogue with another one is made anew
-FIGURES_FOLDER = "figures"
+LAYOUT = "2"  # of the rows: a catalogue with another one is made anew
 KEY_TYPES = {"root": "VARCHAR", "folder": "VARCHAR"}
 Key = tuple[str, str]  # root and folder of a run
 
@@ -104,21 +105,24 @@ def load_rows(folder: Path, database: "DuckDBPyConnection | None") -> tuple[list
     """Return the rows of the runs in a folder, newest first, and the Parquet file that holds them.
 
     From its catalogue, with what changed since, which is read but not written; the file is None
-    then. Without a catalogue the runs in the folder are read.
+    then. Without a catalogue, or with a damaged one, all runs in the folder are read.
     """
     catalog = next(
         (c for c in (folder, folder / CATALOG_FOLDER) if (c / RUNS_FILE).is_file()), None
     )
-    if catalog is not None and database is not None:
+    if catalog is None or database is None:
+        return _sort_newest_first(_refresh(folder, ["."], None).rows.values()), None
+    try:
         before = _read_rows(database, catalog)
-        roots = dict.fromkeys(root for root, _ in before) or {os.pardir: None}
-        refreshed = _refresh(catalog, list(roots), before)
-        rows = _sort_newest_first(refreshed.rows.values())
-        for row in rows:
-            row["folder"] = os.path.relpath(catalog / f"{row['root']}/{row['folder']}", folder)
-        return rows, None if refreshed.is_changed else catalog / RUNS_FILE
-    folders = find_run_folders(folder)
-    return [_read_run(run, str(run.relative_to(folder)))[0].to_columns() for run in folders], None
+    except InputError as error:
+        error_console.print(f"warning: {error}", highlight=False, soft_wrap=True)
+        return load_rows(folder, None)
+    roots = dict.fromkeys(root for root, _ in before) or {os.pardir: None}
+    refreshed = _refresh(catalog, list(roots), before)
+    rows = _sort_newest_first(refreshed.rows.values())
+    for row in rows:
+        row["folder"] = os.path.relpath(catalog / f"{row['root']}/{row['folder']}", folder)
+    return rows, None if refreshed.is_changed else catalog / RUNS_FILE
 
 
 def _read_run(
@@ -129,54 +133,47 @@ def _read_run(
     return read_run(folder, name, before)
 
 
-def find_archived_runs(root: Path) -> Iterator[tuple[Path, str]]:
-    """Yield (folder, state of its files) of each run in or below a folder, hidden ones apart."""
-    for path, folders, files in os.walk(root):
-        is_run = "run.mcap" in files or PARTS_FOLDER in folders
-        folders[:] = sorted(
-            name for name in folders if not name.startswith(".") and name != FIGURES_FOLDER
-        )
-        if is_run:
-            yield Path(path), _describe_files(path)
-
-
-def _describe_files(folder: str) -> str:
+def _describe_files(run: Path) -> str:
     """Return size and last change of the files of a run, by which a change of them is noticed."""
     parts = [LAYOUT]
-    for name in ("run.mcap", "summary.json", NOTES_FILE):
-        try:
-            state = os.stat(os.path.join(folder, name))
-        except OSError:
-            continue
-        parts.append(f"{name} {state.st_size} {state.st_mtime_ns}")
+    for name in (
+        (LOG_NAME, PARTS_FOLDER, "summary.json", NOTES_FILE) if run.suffix != ".mcap" else ("",)
+    ):
+        with suppress(OSError):
+            state = os.stat(os.path.join(run, name) if name else run)
+            parts.append(f"{name or LOG_NAME} {state.st_size} {state.st_mtime_ns}")
     return "; ".join(parts)
 
 
 def _refresh(
     catalog: Path,
     roots: Iterable[str],
-    before: Mapping[Key, Row],
+    before: Mapping[Key, Row] | None,
     tell: Callable[[int, int], None] = lambda done, total: None,
 ) -> _Refreshed:
-    """Return the rows of all runs below the roots, of those that did not change as they were."""
+    """Return the rows of all runs below the roots, of those that did not change as they were.
+
+    Without rows of a catalogue `before` no file is hashed.
+    """
     refreshed = _Refreshed(is_changed=False)
     runs = {
-        (root, os.path.relpath(folder, catalog / root)): (folder, files)
+        (root, os.path.relpath(run, catalog / root)): run
         for root in roots
-        for folder, files in find_archived_runs(Path(os.path.normpath(catalog / root)))
+        for run in iter_runs(Path(os.path.normpath(catalog / root)))
     }
-    for number, (key, (folder, files)) in enumerate(runs.items(), start=1):
-        row = before.get(key)
+    for number, (key, folder) in enumerate(runs.items(), start=1):
+        row, files = (before or {}).get(key), _describe_files(folder)
         if row is None or row["files"] != files:
             is_known = row is not None and str(row["files"]).split(";")[0] == LAYOUT
-            read, steps = _read_run(folder, key[1], row if row and is_known else {})
+            known = row if row and is_known else {}
+            read, steps = _read_run(folder, key[1], None if before is None else known)
             row = replace(read, root=key[0], files=files).to_columns()
             if steps is not None:
                 refreshed.steps[key] = steps
             refreshed.is_changed = True
             tell(number, len(runs))
         refreshed.rows[key] = row
-    refreshed.is_changed |= refreshed.rows.keys() != before.keys()
+    refreshed.is_changed |= refreshed.rows.keys() != (before or {}).keys()
     return refreshed
 
 
@@ -189,7 +186,7 @@ def _find_start(row: Row) -> tuple[float, float]:
     changed_s = 0.0
     for part in str(row["files"]).split("; "):
         name, _, state = part.partition(" ")
-        if name == "run.mcap":
+        if name in (LOG_NAME, PARTS_FOLDER):
             changed_s = float(state.split()[1]) / 1e9
     return order_by_start(row["started_at"], changed_s)
 

@@ -16,10 +16,10 @@ from typing import Literal
 from pydantic import Field
 
 from table_io.errors import InputError
-from twin.archive.catalog import find_archived_runs
 from twin.archive.query import index_runs
 from twin.archive.run_row import Cell, Row, replace_nonfinite
 from twin.recording.run_paths import resolve_log_path
+from twin.report.run_index import iter_runs
 from twin.results.contract import Contract
 from twin.results.sealed_lines import SealedLine, SealedLines
 from twin.setup.folders import claim_folder, find_sharing_problem, make_run_folder
@@ -218,7 +218,7 @@ def _find_logs(places: Iterable[Path], where: str | None) -> list[str]:
         elif where is not None:
             logs_there = [place / row.folder for row in index_runs(place, where)]
         elif place.is_dir():
-            logs_there = [folder for folder, _ in find_archived_runs(place)]
+            logs_there = [*iter_runs(place)]
         else:
             raise InputError("no such log or folder", where=place)
         logs |= dict.fromkeys(str(_resolve_log(path)) for path in logs_there)

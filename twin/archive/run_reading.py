@@ -17,6 +17,7 @@ from twin.model.config import ModelConfig
 from twin.recording.reader import read_start
 from twin.recording.recovery import ends_whole
 from twin.recording.run_paths import explain_unmerged_parts
+from twin.report.run_index import LOG_NAME
 from twin.results.contracts import ChannelError, Response, RunSummary, StepEntry
 from twin.results.summary import parse_toml_tables
 from twin.system.files import hash_file
@@ -26,23 +27,26 @@ SIDES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "drift", "spread")  #
 
 
 def read_run(folder: Path, name: str, before: Row | None = None) -> tuple[RunRow, list[Row] | None]:
-    """Return the row of the run in a folder, named `name`, and the rows of its steps.
+    """Return the row of the run in a folder, or of a single log, and the rows of its steps.
 
+    `name`: of the run in its row. A single log, as of an import, has no summary and no notes.
     What is missing, damaged or of another version is stated in `problem`. `before` is its row in a
     catalogue, {} if it is new there: the files are hashed, and if they hold what they held, only
     the notes are read and the steps are None.
     """
     problems: list[str] = []
-    row = _add_notes(RunRow(name), folder, problems)
+    is_single = folder.suffix == ".mcap" and folder.is_file()
+    log = folder if is_single else folder / LOG_NAME
+    row = RunRow(name) if is_single else _add_notes(RunRow(name), folder, problems)
     if before is not None:
-        hashes = (hash_file(folder / "run.mcap"), hash_file(folder / "summary.json"))
+        hashes = (hash_file(log), hash_file(folder / "summary.json"))
         row = replace(row, sha256=hashes[0] or None, summary_sha256=hashes[1] or None)
         held = (before.get("sha256"), before.get("summary_sha256"))
         has_faulty_notes = bool(problems) or NOTES_FILE in str(before.get("problem"))
         if row.sha256 and not has_faulty_notes and held == (row.sha256, row.summary_sha256):
             return RunRow.from_columns(before | {"note": row.note, "tags": [*row.tags]}), None
-    row = _add_start(row, folder, problems)
-    row, steps = _add_summary(row, folder, problems)
+    row = _add_start(row, log, problems)
+    row, steps = (row, []) if is_single else _add_summary(row, folder, problems)
     return replace(row, problem="; ".join(problems) or None), steps
 
 
@@ -55,18 +59,18 @@ def _add_notes(row: RunRow, folder: Path, problems: list[str]) -> RunRow:
     return replace(row, note=notes.note or None, tags=notes.tags)
 
 
-def _add_start(row: RunRow, folder: Path, problems: list[str]) -> RunRow:
+def _add_start(row: RunRow, log: Path, problems: list[str]) -> RunRow:
     """Return the row with what the start record of the recording states."""
-    if reason := explain_unmerged_parts(folder):
+    if reason := explain_unmerged_parts(log.parent):
         problems.append(reason)
         return row
     try:
-        start = read_start(folder / "run.mcap")
+        start = read_start(log)
     except (InputError, OSError) as error:
         problems.append(f"no start of the recording: {error}")
         return row
-    if not ends_whole(folder / "run.mcap"):
-        problems.append("run.mcap is cut off: `shaketwin verify` lists what is lost")
+    if not ends_whole(log):
+        problems.append(f"{log.name} is cut off: `shaketwin verify` lists what is lost")
     try:
         parameters = _list_model_values(start.model_toml, start.profile_toml)
     except InputError as error:
@@ -160,8 +164,6 @@ def _add_summary(row: RunRow, folder: Path, problems: list[str]) -> tuple[RunRow
             twin_reason=twin.reason or None,
             misfit=twin.misfit,
             misfit_worst=twin.misfit_worst,
-            twin_misfit=twin.misfit,
-            twin_misfit_worst=twin.misfit_worst,
             steps_outside=twin.steps_outside,
             steps_apart=twin.steps_apart,
         )

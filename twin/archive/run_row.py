@@ -27,8 +27,8 @@ class RunRow:
     verdict: str | None = None
     twin_verdict: str | None = None
     excitation_verdict: str | None = None
-    misfit: float | None = None  # as `twin_misfit`; the names of `runs --json` from the start
-    misfit_worst: float | None = None
+    misfit: float | None = None  # of u in multiples of the noise: median over the steps
+    misfit_worst: float | None = None  # the same at the worst step
     nrmse: float | None = None  # of u, restarted twin
     warnings: int | None = None
     dropouts: int | None = None
@@ -39,8 +39,6 @@ class RunRow:
     run: str | None = None
     reason: str | None = None
     twin_reason: str | None = None
-    twin_misfit: float | None = None  # of u in multiples of the noise: median over the steps
-    twin_misfit_worst: float | None = None  # the same at the worst step
     gap_mm: float | None = None
     level_g: float | None = None  # largest level of the steps
     mass_kg: float | None = None
@@ -72,6 +70,7 @@ class RunRow:
     def to_columns(self) -> Row:
         """Return the row by column."""
         row: Row = {name: getattr(self, name) for name in NAMES}
+        row |= {alias: row[name] for alias, name in ALIASES.items()}
         return row | {"tags": [*self.tags]} | dict(self.values or {})
 
     @classmethod
@@ -79,6 +78,8 @@ class RunRow:
         """Return the run of a row; columns that the class does not name are its `values`."""
         values: dict[str, Any] = dict(row)
         stated = {name: values.pop(name) for name in NAMES if name in values}
+        for alias in ALIASES:
+            values.pop(alias, None)
         stated["tags"] = tuple(stated.get("tags") or ())
         return cls(**stated, values=values)
 
@@ -92,6 +93,8 @@ def replace_nonfinite(row: Row) -> Row:
 
 
 NAMES = tuple(field.name for field in fields(RunRow) if field.name != "values")
+# Columns under a second name, as expressions are written.
+ALIASES = {"twin_misfit": "misfit", "twin_misfit_worst": "misfit_worst"}
 # Types of the columns in SQL; those that are not named hold numbers.
 NUMBER_TYPE = "DOUBLE"
 SQL_TYPES = {str: "VARCHAR", int: "BIGINT"}

@@ -82,7 +82,7 @@ function showPair(section, pair) {
   ["", pair[0].folder, pair[1].folder, "change"].forEach((text) => add(heads, "th", { class: "text" }, text));
   for (const key of keys) {
     const [a, b] = pair.map((row) => row[key]);
-    if (show(a) === show(b) || ["path", "files", "folder", "run", "misfit", "misfit_worst"].includes(key) || key.endsWith("sha256")) continue;
+    if (show(a) === show(b) || ["path", "files", "folder", "run", "twin_misfit", "twin_misfit_worst"].includes(key) || key.endsWith("sha256")) continue;
     const line = add(body, "tr"), both = typeof a === "number" && typeof b === "number";
     add(line, "td", { class: "text" }, key);
     [show(a), show(b), both ? `${show(b - a)}${a ? ` (${Number(((100 * (b - a)) / Math.abs(a)).toPrecision(3))} %)` : ""}` : ""].forEach((text) => add(line, "td", { class: "text long" }, text));
@@ -117,7 +117,7 @@ function drawTrend() {
     dot.addEventListener("click", () => { box(point.line).checked = !box(point.line).checked; choose(); });
   }
 }
-const first = ["stiffness", "damping", "gap_r", "gap_l", "twin_misfit"];
+const first = ["stiffness", "damping", "gap_r", "gap_l", "misfit"];
 const numeric = [...new Set(rows.flatMap(Object.keys))].filter((key) => !/_(low|high)$/.test(key) && rows.some((row) => typeof row[key] === "number"));
 for (const key of [...first.filter((name) => numeric.includes(name)), ...numeric.filter((name) => !first.includes(name))]) add(quantity, "option", {}, key);
 document.getElementById("filter").addEventListener("input", filter);
