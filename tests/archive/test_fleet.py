@@ -1,6 +1,7 @@
 """A fleet: one command over many logs, resumable, into one table."""
 
 import csv
+import json
 import os
 import random
 import signal
@@ -17,11 +18,13 @@ from tests.input_errors import raises_input_error
 from twin.archive import fleet as fleets
 from twin.archive.fleet import FleetLine, FleetOptions, compute_case, run_fleet
 from twin.archive.notes import note_run
+from twin.model.config import load_model_config
 from twin.results.sealed_lines import SealedLines
 from twin.system.grid import Watch
 from twin.system.process_pool import TaskResult, Workers
 
 LOGS_TO_KILL = 150
+TRUE_STIFFNESS = 36e3  # of the simulated specimen, N/m
 Stop = Callable[[], object]
 
 
@@ -82,6 +85,9 @@ def test_fleet_writes_one_table_with_the_failures(archive: Path, tmp_path: Path)
     assert Path(failed.log).parent.name == "run2"
     assert [bool(row["failure"]) for row in rows] == [False, False, True, False]
     assert {row["content"] for row in rows if not row["failure"]} == {"same"}
+    page = (tmp_path / "out/report.html").read_text()
+    assert "verify over 4 recordings" in page
+    assert page.count(f"<code>{failed.log}</code>") == 1
 
 
 @pytest.mark.usefixtures("here")
@@ -155,8 +161,34 @@ def test_changes_since_an_earlier_fleet_are_listed(log_file: Path, tmp_path: Pat
     assert isinstance(worse.after, float)
     assert worse.after > worse.before
     assert read_table(second / "changes.csv")[0]["column"] in changes
+    page = (second / "report.html").read_text()
+    assert f"Changed since {first}" in page
+    assert "nrmse rel_disp_m" in page
     with raises_input_error(key="--since"):
         run_fleet(FleetOptions("verify", [run], out=tmp_path / "third", since=first))
+
+
+@pytest.mark.usefixtures("here")
+def test_fleet_identifies_each_log_by_itself(log_file: Path, tmp_path: Path) -> None:
+    """The model of a log is in a folder next to the table."""
+    fitted = run_fleet(FleetOptions("identify", [log_file.parent], out=tmp_path / "identify"))
+    (row,) = read_table(tmp_path / "identify/table.csv")
+    assert fitted.failures == ()
+    assert float(row["stiffness_low"]) < TRUE_STIFFNESS < float(row["stiffness_high"])
+    (model,) = (tmp_path / "identify").glob("0000-*/model.toml")
+    assert load_model_config(model)[0].base.stiffness_n_m == float(row["stiffness"])
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("here")
+def test_fleet_discovers_in_each_log_by_itself(log_file: Path, tmp_path: Path) -> None:
+    found = run_fleet(FleetOptions("discover", [log_file.parent], out=tmp_path / "discover"))
+    (row,) = read_table(tmp_path / "discover/table.csv")
+    assert found.failures == ()
+    (folder,) = (tmp_path / "discover").glob("0000-*")
+    verdict = json.loads((folder / "verdict.json").read_text())
+    assert row["verdict"] == verdict["verdict"]
+    assert (folder / "model.toml").is_file()
 
 
 def test_command_states_failures_by_its_exit_code(archive: Path, tmp_path: Path) -> None:

@@ -1,7 +1,8 @@
 """Task: one command over many logs, on all cores or a cluster; resumable, into one table.
 
 The folder of a fleet holds `fleet.json` (task, model, logs), `results.jsonl` with a sealed line for
-each log that is done, `table.csv`, with --since `changes.csv`, and a folder for what a log left.
+each log that is done, `table.csv`, with --since `changes.csv`, both in `report.html`, and a folder
+for what a log left.
 """
 
 import csv
@@ -18,6 +19,7 @@ from pydantic import Field
 from table_io.errors import InputError
 from twin.archive.query import index_runs
 from twin.archive.run_row import Cell, Row, replace_nonfinite
+from twin.drawing.page import render_page
 from twin.recording.run_paths import resolve_log_path
 from twin.report.run_index import iter_runs
 from twin.results.contract import Contract
@@ -30,7 +32,7 @@ from twin.system.process_pool import Workers, run_tasks
 from twin.system.versions import find_version_problem, read_installed_versions
 
 DEFINITION_FILE, LINES_FILE = "fleet.json", "results.jsonl"
-TABLE_FILE, CHANGES_FILE = "table.csv", "changes.csv"
+TABLE_FILE, CHANGES_FILE, PAGE_FILE = "table.csv", "changes.csv", "report.html"
 RECORDED = "recorded"  # name of the model that a log holds
 MAX_CASE_S = 24 * 3600.0
 MIN_RELATIVE_CHANGE = 1e-6  # of a number, below which it is the same
@@ -84,6 +86,13 @@ class Change:
     column: str
     before: Cell
     after: Cell
+
+    @property
+    def difference(self) -> float | None:
+        """Return how much a number grew; None for other values."""
+        if isinstance(self.after, float) and isinstance(self.before, float):
+            return self.after - self.before
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,6 +157,7 @@ def run_fleet(options: FleetOptions, watch: Watch | None = None) -> Fleet:
     _write_table(folder / TABLE_FILE, _list_rows(results))
     if options.since is not None:
         _write_table(folder / CHANGES_FILE, _list_change_rows(changes))
+    _write_page(folder / PAGE_FILE, definition, results, changes, options.since)
     return Fleet(folder, len(definition.logs), results, tuple(changes), watch.find_stop())
 
 
@@ -268,12 +278,31 @@ def _list_change_rows(changes: Iterable[Change]) -> list[Row]:
             "column": change.column,
             "before": change.before,
             "after": change.after,
-            "change": change.after - change.before
-            if isinstance(change.after, float) and isinstance(change.before, float)
-            else None,
+            "change": change.difference,
         }
         for change in changes
     ]
+
+
+def _write_page(
+    path: Path,
+    definition: FleetDefinition,
+    lines: Sequence[FleetLine],
+    changes: Sequence[Change],
+    since: Path | None,
+) -> None:
+    """Write the page of a fleet: its results, what failed, and what changed since another one."""
+    text = render_page(
+        Path(__file__).with_name("fleet.html"),
+        definition=definition,
+        lines=lines,
+        failures=[line for line in lines if line.failure],
+        missing=len(definition.logs) - len(lines),
+        columns=[*dict.fromkeys(name for line in lines for name in line.values)],
+        changes=changes,
+        since=since,
+    )
+    replace_text(path, text)
 
 
 def _write_table(path: Path, rows: Sequence[Row]) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from table_io.errors import InputError
-from twin.recording.reader import read_start
 from twin.recording.run_paths import PARTS_FOLDER
 
 LOG_NAME = "run.mcap"
@@ -54,6 +53,8 @@ def _read_start(run: Path) -> tuple[float, float]:
             changed_s = (run / name).stat().st_mtime
     started_at = _read_run_info(run).get("started_at")
     if started_at is None and (run / LOG_NAME).is_file():
+        from twin.recording.reader import read_start  # slow to import, and `runs` is quick
+
         with suppress(InputError, OSError):
             started_at = read_start(run / LOG_NAME).started_at
     return order_by_start(started_at, changed_s)
