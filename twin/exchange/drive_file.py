@@ -23,6 +23,7 @@ import numpy as np
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.errors import InputError
+from twin.exchange.uff58 import NO_AXIS, TIME_CODE, make_axis, write_text_set
 from twin.setup.run_config import read_run_config
 
 CSV_HEADER = "time_s,drive_disp_mm"
@@ -183,27 +184,19 @@ def _write_rpc(path: Path, file: DriveFile) -> None:
 
 
 def _write_uff(path: Path, file: DriveFile) -> None:
-    node = f" {'NONE':<10}{0:10d}{0:4d}"
-    axis = "{:10d}{:5d}{:5d}{:5d} {:<20} {:<20}"
     lines = [
-        f"{-1:6d}",
-        f"{58:6d}",
         "drive_disp_m",
-        f"shaketwin drive of {file.name}"[:80],
+        f"shaketwin drive of {file.name}",
         "NONE",
         f"sha256 {file.sha256}",
         "NONE",
-        f"{1:5d}{1:10d}{0:5d}{0:10d}{node}{node}",
-        f"{4:10d}{file.values_m.size:10d}{1:10d}{0.0:13.5E}{1.0 / file.rate_hz:13.5E}{0.0:13.5E}",
-        axis.format(17, 0, 0, 0, "Time", "s"),
-        axis.format(8, 1, 0, 0, "Displacement", "m"),
-        axis.format(0, 0, 0, 0, "NONE", "NONE"),
-        axis.format(0, 0, 0, 0, "NONE", "NONE"),
     ]
-    for k in range(0, file.values_m.size, 4):
-        lines.append("".join(f"{value:20.12E}" for value in file.values_m[k : k + 4]))
-    lines.append(f"{-1:6d}")
-    path.write_text("\n".join(lines) + "\n", encoding="ascii")
+    shape = f"{4:10d}{file.values_m.size:10d}{1:10d}{0.0:13.5E}{1.0 / file.rate_hz:13.5E}"
+    axes = [(TIME_CODE, "Time", "s"), make_axis("Displacement", "m"), NO_AXIS]
+    rows = (file.values_m[k : k + 4] for k in range(0, file.values_m.size, 4))
+    body = "".join("".join(f"{value:20.12E}" for value in row) + "\n" for row in rows)
+    with path.open("wb") as out:
+        write_text_set(out, 1, lines, shape, axes, body)
 
 
 def _write_mat(path: Path, file: DriveFile) -> None:

@@ -1,12 +1,10 @@
 """Task `export`: conversion of a log to files of other tools."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 from table_io.errors import InputError, require_package
 from table_io.formats.text import write_csv
@@ -85,31 +83,32 @@ def export_log(options: ExportOptions) -> Exported:
             "exports a whole run", where=f"--{kind}", remedy="omit --channel and --steps"
         )
     needs_twin = not options.channels or any(n.startswith(TWIN_PREFIX) for n in options.channels)
-    files: list[Path] = []
-    with TemporaryDirectory() as scratch, ExitStack() as cleanup:
-        whole = restore_log(log, Path(scratch)) if needs_twin else log
+    folder = base.absolute().parent
+    files = [*paths.values(), *filter(None, (layout,))]
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    # Written on the disk of their folder, which they enter when all of them are whole.
+    with TemporaryDirectory(dir=existing, prefix=".export-") as scratch:
+        new = Path(scratch)
+        whole = restore_log(log, new) if needs_twin else log
         rows = _read_rows(whole, options) if {*paths} - {*WHOLE_FORMATS} or crate else None
-        _make_folder(base.absolute().parent, cleanup)
         for kind, path in paths.items():
             if kind == "fmu":
-                write_fmu(log, options.model, path)
+                write_fmu(log, options.model, new / path.name)
             elif rows is None or kind == "rrd":
-                _write_rrd(whole, path)
+                _write_rrd(whole, new / path.name)
             else:
-                _write_rows(kind, rows, path)
-            cleanup.callback(path.unlink, missing_ok=True)
-            files.append(path)
-            if kind == "foxglove" and rows is not None and layout is not None:
-                _write_layout(rows, layout)
-                cleanup.callback(layout.unlink, missing_ok=True)
-                files.append(layout)
+                _write_rows(kind, rows, new / path.name)
+        if layout is not None and rows is not None:
+            (new / layout.name).write_text(build_layout(rows), encoding="utf-8")
+        _require_possible((), files)  # also not since the first look
+        folder.mkdir(parents=True, exist_ok=True)
+        for path in files:
+            (new / path.name).rename(path)
         if crate is not None and rows is not None:
             write_crate(rows, log, files, crate)
             files.append(crate)
-        cleanup.pop_all()  # keep the files
-    if rows is None:
-        return Exported((*files,))
-    return Exported((*files,), rows.size, len(rows.units), rows.is_intact)
+        size = (0, 0, True) if rows is None else (rows.size, len(rows.units), rows.is_intact)
+    return Exported((*files,), *size)
 
 
 def _require_possible(formats: Sequence[str], files: Iterable[Path]) -> None:
@@ -130,91 +129,53 @@ def _read_rows(path: Path, options: ExportOptions) -> LogTable:
     return rows
 
 
-def _make_folder(folder: Path, cleanup: ExitStack) -> None:
-    """Create a folder with its parents; on failure, new ones that are empty are removed."""
-    for new_folder in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
-        new_folder.mkdir(exist_ok=True)
-        cleanup.callback(_remove_if_empty, new_folder)
-
-
-def _remove_if_empty(folder: Path) -> None:
-    with suppress(OSError):
-        folder.rmdir()
-
-
 def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
     """Write the rows to a new file; imports the library of the format."""
     if kind == "csv":
-        with _open_new(path, "x", encoding="utf-8", newline="") as file:
-            write_csv(rows.units, rows.iter_windows(), file)
+        with path.open("x", encoding="utf-8", newline="") as text:
+            write_csv(rows.units, rows.iter_windows(), text)
+        return
+    if kind == "hdf5":
+        from twin.exchange.nexus import write_hdf5  # imports h5py
+
+        write_hdf5(rows, path)
+        return
+    if kind == "uff":
+        write_uff58(rows, path)
         return
     start = rows.start
-    with _open_new(path, "xb") as file:
+    facts = {**rows.toml_texts, "run": start.run, "started_at": start.started_at}
+    with path.open("xb") as file:
         if kind == "parquet":
             from table_io.formats.parquet import write_parquet
 
-            texts = {"run": start.run, "rate_hz": repr(start.rate_hz), **rows.toml_texts}
-            texts["started_at"] = start.started_at
+            texts = facts | {"rate_hz": repr(start.rate_hz)}
             write_parquet(rows.units, rows.iter_windows(), texts, file)
         elif kind == "mat":
             from table_io.formats.mat import write_mat
 
-            facts: dict[str, str | float] = {**rows.toml_texts, "run": start.run}
-            facts["started_at"] = start.started_at
-            facts["rate_hz"] = start.rate_hz
             # one by one, to limit memory
             columns = (rows.read_columns(slice(None), name) for name in rows.units)
-            write_mat(rows.units, columns, facts, file)
-        elif kind == "hdf5":
-            from twin.exchange.nexus import write_hdf5  # imports h5py
-
-            write_hdf5(rows, path)
-        elif kind == "uff":
-            write_uff58(rows, path)
+            write_mat(rows.units, columns, {**facts, "rate_hz": start.rate_hz}, file)
         else:
             write_foxglove(rows, file)
-
-
-def _write_layout(rows: LogTable, path: Path) -> None:
-    """Write the layout of Foxglove for the rows to a new file."""
-    with _open_new(path, "x", encoding="utf-8") as file:
-        file.write(build_layout(rows))
 
 
 def _write_rrd(path: Path, output_path: Path) -> None:
     """Write a Rerun file in batches; a log that is out of order must fit into memory."""
     from twin.viewer.view import BATCH_ITEMS, RerunView, write_rrd
 
+    batches = iter_batches(path, BATCH_ITEMS)
+    first = next(batches, None) if batches is not None else None
+    if batches is None or first is None or not isinstance(first[0], RunStart):
+        write_rrd(open_recording(path), output_path)
+        return
+    view = RerunView(first[0], save=output_path)
     try:
-        batches = iter_batches(path, BATCH_ITEMS)
-        first = next(batches, None) if batches is not None else None
-        if batches is None or first is None or not isinstance(first[0], RunStart):
-            write_rrd(open_recording(path), output_path)
-            return
-        view = RerunView(first[0], save=output_path)
-        try:
-            for items in chain([first], batches):
-                view.feed(items)
-        finally:
-            view.close()
-    except BaseException:
-        output_path.unlink(missing_ok=True)
-        raise
-
-
-@contextmanager
-def _open_new(path: Path, mode: str, **options: Any) -> Iterator[Any]:
-    """Open a new file; remove it if writing fails."""
-    try:
-        with path.open(mode, **options) as file:
-            yield file
-    except FileExistsError:
-        raise InputError(
-            "exists already", where=path, remedy="nothing is ever overwritten"
-        ) from None
-    except BaseException:
-        path.unlink(missing_ok=True)
-        raise
+        for items in chain([first], batches):
+            view.feed(items)
+    finally:
+        view.close()
 
 
 def _output_path(file_format: str, base: Path) -> Path:

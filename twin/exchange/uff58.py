@@ -5,7 +5,6 @@ recorded is NaN. Frequency responses are text, over the frequencies of the steps
 pyuff writes zeros for NaN.
 """
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
@@ -13,7 +12,6 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.channels import TIME_COLUMN
-from table_io.control.order_tracking import Complex1D
 from twin.exchange.response_functions import REFERENCE, compute_sweep_responses
 from twin.recording.tabular import LABEL_UNITS, LogTable
 
@@ -37,39 +35,34 @@ def write_uff58(rows: LogTable, path: Path) -> None:
                 values = np.full(int(index[-1]) - first + 1, np.nan)
                 values[index - first] = rows.read_columns(slice(None), name)[name]
                 shape = f"{4:10d}{values.size:10d}{1:10d}{first * step_s:13.5E}{step_s:13.5E}"
-                axes = [(TIME_CODE, "Time", "s"), _make_axis(name, unit), NO_AXIS]
+                axes = [(TIME_CODE, "Time", "s"), make_axis(name, unit), NO_AXIS]
                 _write_history(file, [name, *texts], shape, axes, values)
         for response in compute_sweep_responses(rows):
             for name, ratio in response.ratios.items():
                 shape = f"{6:10d}{ratio.size:10d}{0:10d}{0.0:13.5E}{0.0:13.5E}"
                 axes = [
                     (FREQUENCY_CODE, "Frequency", "Hz"),
-                    _make_axis(name, rows.units[name]),
-                    _make_axis(REFERENCE, rows.units[REFERENCE]),
+                    make_axis(name, rows.units[name]),
+                    make_axis(REFERENCE, rows.units[REFERENCE]),
                 ]
                 lines = [f"{name}/{REFERENCE} {response.direction}", *texts]
-                _write_response(file, lines, shape, axes, response.frequency_hz, ratio)
+                pairs = zip(response.frequency_hz.tolist(), ratio.tolist(), strict=True)
+                body = "".join(f"{hz:13.5E}{z.real:20.12E}{z.imag:20.12E}\n" for hz, z in pairs)
+                write_text_set(file, 4, lines, shape, axes, body)
 
 
-def _make_axis(name: str, unit: str) -> Axis:
+def make_axis(name: str, unit: str) -> Axis:
     return QUANTITY_CODES.get(unit, GENERAL_CODE), name, unit or "NONE"
 
 
 def _format_head(function_type: int, texts: list[str], shape: str, axes: list[Axis]) -> str:
     """Return records 1 to 11 of a set: texts, function, shape of the data, and the axes."""
     place = f" {'NONE':<10}{1:10d}{1:4d}"
-    return "".join(f"{line}\n" for line in _list_records(function_type, texts, shape, axes, place))
-
-
-def _list_records(
-    function_type: int, texts: list[str], shape: str, axes: list[Axis], place: str
-) -> Iterator[str]:
-    for text in texts:
-        yield text[:80]
-    yield f"{function_type:5d}{1:10d}{0:5d}{0:10d}{place}{place}"
-    yield f"{shape}{0.0:13.5E}"
+    lines = [text[:80] for text in texts]
+    lines += [f"{function_type:5d}{1:10d}{0:5d}{0:10d}{place}{place}", f"{shape}{0.0:13.5E}"]
     for code, name, unit in (*axes, NO_AXIS):
-        yield f"{code:10d}{0:5d}{0:5d}{0:5d} {name[:20]:<20} {unit[:20]:<20}"
+        lines.append(f"{code:10d}{0:5d}{0:5d}{0:5d} {name[:20]:<20} {unit[:20]:<20}")
+    return "\n".join(lines) + "\n"
 
 
 def _write_history(
@@ -83,18 +76,9 @@ def _write_history(
     file.write(b"\n" + DELIMITER.encode())
 
 
-def _write_response(
-    file: BinaryIO,
-    texts: list[str],
-    shape: str,
-    axes: list[Axis],
-    frequency_hz: Float1D,
-    ratio: Complex1D,
+def write_text_set(
+    file: BinaryIO, function_type: int, texts: list[str], shape: str, axes: list[Axis], body: str
 ) -> None:
-    """Write a frequency response (type 4) as a text set."""
-    body = "".join(
-        f"{hz:13.5E}{value.real:20.12E}{value.imag:20.12E}\n"
-        for hz, value in zip(frequency_hz.tolist(), ratio.tolist(), strict=True)
-    )
-    head = f"{DELIMITER}{58:6d}\n" + _format_head(4, texts, shape, axes)
+    """Write a function as a text set, its data as lines."""
+    head = f"{DELIMITER}{58:6d}\n" + _format_head(function_type, texts, shape, axes)
     file.write((head + body + DELIMITER).encode("ascii", "replace"))
