@@ -5,7 +5,7 @@ of MATLAB as in `mat`. Links into other files are never followed.
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from table_io.formats.table import (
 from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, add_fact, find_fact, find_label
 
 Attributes = Mapping[str, str | list[str]]
+Fields = Iterable[tuple[str, Any, Attributes]]
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
 MAX_REFERENCES = 1000  # of a cell array
@@ -142,37 +143,17 @@ def _to_text(value: Any) -> str:
     return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NexusField:
-    """Field of a NeXus group: a text, a number or an array, with its attributes."""
+def write_nexus(path: Path, groups: Iterable[tuple[str, Attributes, Fields]]) -> None:
+    """Write groups (path, attributes, fields) as an HDF5 file in the layout of NeXus.
 
-    name: str
-    value: Any
-    attributes: Attributes = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class NexusGroup:
-    """Group of a NeXus file: its path, its class, attributes and fields."""
-
-    path: str
-    nx_class: str
-    attributes: Attributes
-    fields: Iterable[NexusField]
-
-
-def write_nexus(path: Path, groups: Iterable[NexusGroup]) -> None:
-    """Write groups as an HDF5 file in the layout of NeXus; arrays are compressed without loss."""
+    A field is (name, value, attributes); arrays are compressed without loss, one after the other.
+    """
     with h5py.File(path, "w") as file:
         file.attrs["default"], file.attrs["creator"] = "entry", "shaketwin"
-        for group in groups:
-            place = file.create_group(group.path)
-            place.attrs["NX_class"] = group.nx_class
-            for name, text in group.attributes.items():
-                place.attrs[name] = text
-            for entry in group.fields:
-                is_array = isinstance(entry.value, np.ndarray)
+        for name, attributes, fields in groups:
+            place = file.create_group(name)
+            place.attrs.update(attributes)
+            for key, value, of_field in fields:
+                is_array = isinstance(value, np.ndarray)
                 options = {"compression": "gzip", "shuffle": True} if is_array else {}
-                dataset = place.create_dataset(entry.name, data=entry.value, **options)
-                for name, text in entry.attributes.items():
-                    dataset.attrs[name] = text
+                place.create_dataset(key, data=value, **options).attrs.update(of_field)

@@ -110,6 +110,35 @@ def test_frequency_responses_are_those_of_a_planted_motion(
     assert response["orddenom_axis_units_lab"].strip() == "m/s2"
 
 
+def test_spectrograms_show_the_sine_of_each_step(tmp_path: Path) -> None:
+    """The area below the peak is the mean square of the motion; lost samples leave a window out."""
+    h5py = pytest.importorskip("h5py")
+    start = start_record()
+    time_s = np.arange(round(30.0 * RATE)) / RATE
+    hz = np.where(time_s < 15.0, 5.0, 12.5)
+    values = np.zeros((len(start.channels), time_s.size))
+    row = start.channels.index("table_acc_m_s2")
+    values[row] = 7.0 + 3.0 * np.sin(2 * np.pi * hz * time_s)
+    values[row, round(25.0 * RATE)] = np.nan
+    labels = (np.zeros(time_s.size, dtype=np.int64),) * 3
+    block = Block("meas", 0, RATE, start.channels, values, *labels)
+    write_items(tmp_path / "run.mcap", [start, block], start)
+    export_log(ExportOptions(tmp_path / "run.mcap", ("hdf5",), tmp_path / "out"))
+    with h5py.File(tmp_path / "out.h5") as file:
+        group = file["entry/spectrogram"]
+        window_s, frequency = group["time_s"][:], group["frequency"][:]
+        density = group["table_acc_m_s2"][:]
+        assert group["table_acc_m_s2"].attrs["units"] == "(m/s2)2/Hz"
+    assert density.shape == (window_s.size, frequency.size)
+    is_lost = np.abs(window_s - 25.0) <= 2.0
+    assert np.isnan(density[is_lost]).all()
+    for expected_hz, is_inside in ((5.0, window_s < 13.0), (12.5, (window_s > 17.0) & ~is_lost)):
+        part = density[is_inside]
+        assert part.shape[0] >= 3
+        assert (frequency[np.argmax(part, axis=1)] == expected_hz).all()
+        np.testing.assert_allclose(part.sum(axis=1) * frequency[1], 0.5 * 3.0**2, rtol=1e-6)
+
+
 def test_a_crate_describes_the_files_beside_it(both: tuple[Path, Path], tmp_path: Path) -> None:
     log, _ = both
     options = ExportOptions(log, ("csv", "mat"), tmp_path / "out", has_crate=True)

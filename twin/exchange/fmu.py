@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FunctionType
 from typing import Any
-from xml.etree import ElementTree as xml
+from xml.sax.saxutils import quoteattr
 
 import llvmlite.binding as llvm
 from numba import carray, types
@@ -183,27 +183,25 @@ def _write_header(rate_hz: float, arrays: Mapping[str, Float1D]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _describe_unit(identity: str, start: RunStart) -> bytes:
+def _describe_unit(identity: str, start: RunStart) -> str:
     """Return modelDescription.xml of a unit."""
     step = repr(1.0 / start.rate_hz)
-    root = xml.Element(
-        "fmiModelDescription", fmiVersion="3.0", modelName=NAME, instantiationToken=identity,
-        generationTool="shaketwin", description=f"Specimen of {start.run} between two bumpers",
-    )  # fmt: skip
-    xml.SubElement(
-        root, "CoSimulation", modelIdentifier=NAME, fixedInternalStepSize=step,
-        canHandleVariableCommunicationStepSize="true",
-    )  # fmt: skip
-    xml.SubElement(root, "DefaultExperiment", startTime="0", stepSize=step)
-    variables = xml.SubElement(root, "ModelVariables")
-    structure = xml.SubElement(root, "ModelStructure")
+    variables, outputs = "", ""
     for number, (name, (causality, meaning)) in enumerate(VARIABLES.items()):
-        entry = xml.SubElement(
-            variables, "Float64", name=name, valueReference=str(number), causality=causality,
-            variability="continuous", description=meaning,
-        )  # fmt: skip
-        if causality == "input":
-            entry.set("start", "0")
-        if causality == "output":
-            xml.SubElement(structure, "Output", valueReference=str(number))
-    return xml.tostring(root, "utf-8", xml_declaration=True)
+        begin = ' start="0"' if causality == "input" else ""
+        variables += (
+            f'  <Float64 name="{name}" valueReference="{number}" causality="{causality}" '
+            f'variability="continuous" description="{meaning}"{begin}/>\n'
+        )
+        outputs += f'  <Output valueReference="{number}"/>\n' if causality == "output" else ""
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n'
+        f'<fmiModelDescription fmiVersion="3.0" modelName="{NAME}" '
+        f'instantiationToken="{identity}" generationTool="shaketwin" '
+        f"description={quoteattr(f'Specimen of {start.run} between two bumpers')}>\n"
+        f' <CoSimulation modelIdentifier="{NAME}" fixedInternalStepSize="{step}" '
+        'canHandleVariableCommunicationStepSize="true"/>\n'
+        f' <DefaultExperiment startTime="0" stepSize="{step}"/>\n'
+        f" <ModelVariables>\n{variables} </ModelVariables>\n"
+        f" <ModelStructure>\n{outputs} </ModelStructure>\n</fmiModelDescription>\n"
+    )

@@ -2,76 +2,73 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 from table_io.channels import TIME_COLUMN
-from table_io.formats.hdf5 import NexusField, NexusGroup, write_nexus
-from twin.exchange.response_functions import REFERENCE, compute_sweep_responses
-from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, LogTable
+from table_io.formats.hdf5 import Attributes, Fields, write_nexus
+from twin.exchange.response_functions import (
+    REFERENCE,
+    compute_spectrograms,
+    compute_sweep_responses,
+    list_measured_channels,
+)
+from twin.recording.tabular import TWIN_PREFIX, LogTable
 
 
 def write_hdf5(rows: LogTable, path: Path) -> None:
-    """Write a run as one HDF5 file in the layout of NeXus: an NXentry with what belongs to it."""
-    start = rows.start
-    twins = [name for name in rows.units if name.startswith(TWIN_PREFIX)]
-    measured = [name for name in rows.units if name not in (TIME_COLUMN, *twins)]
-    signal = next((name for name in measured if name not in LABEL_UNITS), measured[0])
-    groups = [
-        NexusGroup(
-            "entry",
-            "NXentry",
-            {"default": "measured"},
-            [
-                NexusField("title", start.name),
-                NexusField("experiment_identifier", start.run),
-                NexusField("start_time", start.started_at),
-                NexusField("program_name", "shaketwin", {"version": start.versions["shaketwin"]})
-                if "shaketwin" in start.versions
-                else NexusField("program_name", "shaketwin"),
-                NexusField("sampling_rate", start.rate_hz, {"units": "Hz"}),
-            ],
-        ),
-        NexusGroup(
-            "entry/measured",
-            "NXdata",
-            {"signal": signal, "axes": [TIME_COLUMN]},
-            _list_fields(rows, [TIME_COLUMN, *measured]),
-        ),
-        NexusGroup(
-            "entry/configuration",
-            "NXcollection",
-            {},
-            [NexusField(name, text) for name, text in rows.toml_texts.items()],
-        ),
+    """Write a run as one HDF5 file: measurement, twin, configuration, responses, spectrograms."""
+    write_nexus(path, _iter_groups(rows))
+
+
+def _iter_groups(rows: LogTable) -> Iterator[tuple[str, Attributes, Fields]]:
+    start, units = rows.start, rows.units
+    twins = [name for name in units if name.startswith(TWIN_PREFIX)]
+    measured = [name for name in units if name not in (TIME_COLUMN, *twins)]
+    channels = list_measured_channels(rows) or measured
+    program = {"version": start.versions["shaketwin"]} if "shaketwin" in start.versions else {}
+    entry: list[tuple[str, Any, Attributes]] = [
+        ("title", start.name, {}),
+        ("experiment_identifier", start.run, {}),
+        ("start_time", start.started_at, {}),
+        ("program_name", "shaketwin", program),
+        ("sampling_rate", start.rate_hz, {"units": "Hz"}),
     ]
+    yield "entry", {"NX_class": "NXentry", "default": "measured"}, entry
+    texts: Fields = ((name, text, {}) for name, text in rows.toml_texts.items())
+    yield "entry/configuration", {"NX_class": "NXcollection"}, texts
+    yield _make_data("measured", channels[0], [TIME_COLUMN], _read_fields(rows, measured))
     if twins:
-        groups.append(
-            NexusGroup(
-                "entry/twin",
-                "NXdata",
-                {"signal": twins[0], "axes": [TIME_COLUMN]},
-                _list_fields(rows, [TIME_COLUMN, *twins]),
-            )
-        )
+        yield _make_data("twin", twins[0], [TIME_COLUMN], _read_fields(rows, twins))
     for response in compute_sweep_responses(rows):
-        fields = [NexusField("frequency", response.frequency_hz, {"units": "Hz"})]
-        for name, ratio in response.ratios.items():
-            fields.append(NexusField(name, ratio, {"units": _divide_unit(rows, name)}))
-        attributes: dict[str, str | list[str]] = {
-            "signal": next(iter(response.ratios)),
-            "axes": ["frequency"],
-            "reference": REFERENCE,
-        }
-        groups.append(NexusGroup(f"entry/frf_{response.direction}", "NXdata", attributes, fields))
-    write_nexus(path, groups)
+        fields: Fields = (
+            ("frequency", response.frequency_hz, {"units": "Hz"}),
+            *(
+                (name, ratio, {"units": f"({units[name]})/({units[REFERENCE]})"})
+                for name, ratio in response.ratios.items()
+            ),
+        )
+        name = f"frf_{response.direction}"
+        yield _make_data(name, channels[0], ["frequency"], fields, reference=REFERENCE)
+    if (spectrograms := compute_spectrograms(rows)) is not None:
+        time_s, frequency_hz, densities = spectrograms
+        axes: Fields = (
+            (TIME_COLUMN, time_s, {"units": "s", "start": start.started_at}),
+            ("frequency", frequency_hz, {"units": "Hz"}),
+        )
+        values = ((name, each, {"units": f"({units[name]})2/Hz"}) for name, each in densities)
+        names = [TIME_COLUMN, "frequency"]
+        yield _make_data("spectrogram", channels[0], names, (*axes, *values))
 
 
-def _list_fields(rows: LogTable, names: Iterable[str]) -> Iterator[NexusField]:
-    for name in names:
+def _make_data(
+    name: str, signal: str, axes: list[str], fields: Fields, **more: str
+) -> tuple[str, Attributes, Fields]:
+    return f"entry/{name}", {"NX_class": "NXdata", "signal": signal, "axes": axes, **more}, fields
+
+
+def _read_fields(rows: LogTable, names: Iterable[str]) -> Fields:
+    for name in (TIME_COLUMN, *names):
         attributes = {"units": rows.units[name]} if rows.units[name] else {}
         if name == TIME_COLUMN:
             attributes["start"] = rows.start.started_at
-        yield NexusField(name, rows.read_columns(slice(None), name)[name], attributes)
-
-
-def _divide_unit(rows: LogTable, name: str) -> str:
-    return f"({rows.units[name]})/({rows.units[REFERENCE]})"
+        yield name, rows.read_columns(slice(None), name)[name], attributes

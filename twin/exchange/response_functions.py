@@ -1,19 +1,23 @@
-"""Frequency responses of a stepped sine: each channel over the acceleration of the table, by step.
+"""Spectra of a log: frequency responses of a stepped sine, and spectrograms of all channels.
+
+A frequency response is each channel over the acceleration of the table, by step.
 
 The fundamentals are those of order tracking over the measured cycles of a step. A specimen with
 contacts is not linear: the ratio holds at the level and in the direction of its sweep.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
-from table_io.block import Float1D, Label
+from table_io.block import Float1D, Float2D, Label
 from table_io.channels import TIME_COLUMN
 from table_io.control.order_tracking import Complex1D, track_harmonics
 from twin.recording.tabular import DIRECTION_SIGNS, LABEL_UNITS, TWIN_PREFIX, LogTable
 
 REFERENCE = "table_acc_m_s2"
+SPECTRUM_WINDOW_S = 4.0  # of a spectrogram: lines 0.25 Hz apart
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,15 +29,50 @@ class SweepResponse:
     ratios: dict[str, Complex1D]
 
 
-def compute_sweep_responses(rows: LogTable) -> list[SweepResponse]:
-    """Return the responses of the directions of a log; [] without steps or table acceleration."""
-    if REFERENCE not in rows.units:
-        return []
-    channels = [
+def list_measured_channels(rows: LogTable) -> list[str]:
+    """Return the columns that were measured, without time and labels."""
+    return [
         name
         for name in rows.units
         if name not in (TIME_COLUMN, *LABEL_UNITS) and not name.startswith(TWIN_PREFIX)
     ]
+
+
+def compute_spectrograms(
+    rows: LogTable,
+) -> tuple[Float1D, Float1D, Iterator[tuple[str, Float2D]]] | None:
+    """Return (times in s of the windows, frequencies in Hz, power density of each channel).
+
+    A density is one-sided, (window, frequency), in unit^2/Hz, of windows of SPECTRUM_WINDOW_S that
+    overlap by half, without their means (Hann; Welch 1967); NaN where samples are lost. None for a
+    log that is shorter than a window.
+    """
+    rate_hz = rows.start.rate_hz
+    index = rows.sample_index(slice(None))
+    index -= index[0]
+    size = round(SPECTRUM_WINDOW_S * rate_hz)
+    if size < 2 or index[-1] < size:
+        return None
+    from scipy.signal import spectrogram  # slow to import
+
+    first_s = float(rows.read_columns(slice(0, 1), TIME_COLUMN)[TIME_COLUMN][0])
+
+    def compute(name: str) -> tuple[Float1D, Float1D, Float2D]:
+        values = np.full(int(index[-1]) + 1, np.nan)
+        values[index] = rows.read_columns(slice(None), name)[name]
+        hz, time_s, density = spectrogram(values, rate_hz, "hann", size, size // 2)
+        return hz, time_s + first_s, np.ascontiguousarray(density.T)
+
+    names = list_measured_channels(rows)
+    frequency_hz, time_s, _ = compute(names[0])
+    return time_s, frequency_hz, ((name, compute(name)[2]) for name in names)
+
+
+def compute_sweep_responses(rows: LogTable) -> list[SweepResponse]:
+    """Return the responses of the directions of a log; [] without steps or table acceleration."""
+    if REFERENCE not in rows.units:
+        return []
+    channels = list_measured_channels(rows)
     step, label, time_s = (
         rows.read_columns(slice(None), name)[name] for name in ("step", "label", TIME_COLUMN)
     )
