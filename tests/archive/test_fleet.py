@@ -182,9 +182,9 @@ def test_fleet_identifies_each_log_by_itself(log_file: Path, tmp_path: Path) -> 
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
 def test_fleet_discovers_in_each_log_by_itself(log_file: Path, tmp_path: Path) -> None:
-    found = run_fleet(FleetOptions("discover", [log_file.parent], out=tmp_path / "discover"))
+    fleet = run_fleet(FleetOptions("discover", [log_file.parent], out=tmp_path / "discover"))
     (row,) = read_table(tmp_path / "discover/table.csv")
-    assert found.failures == ()
+    assert fleet.failures == ()
     (folder,) = (tmp_path / "discover").glob("0000-*")
     verdict = json.loads((folder / "verdict.json").read_text())
     assert row["verdict"] == verdict["verdict"]

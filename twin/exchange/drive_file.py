@@ -23,7 +23,7 @@ import numpy as np
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.errors import InputError
-from twin.exchange.uff58 import NO_AXIS, TIME_CODE, make_axis, write_text_set
+from twin.exchange.uff58 import NO_AXIS, TIME_CODE, describe_axis, write_text_set
 from twin.setup.run_config import read_run_config
 
 CSV_HEADER = "time_s,drive_disp_mm"
@@ -192,7 +192,7 @@ def _write_uff(path: Path, file: DriveFile) -> None:
         "NONE",
     ]
     shape = f"{4:10d}{file.values_m.size:10d}{1:10d}{0.0:13.5E}{1.0 / file.rate_hz:13.5E}"
-    axes = [(TIME_CODE, "Time", "s"), make_axis("Displacement", "m"), NO_AXIS]
+    axes = [(TIME_CODE, "Time", "s"), describe_axis("Displacement", "m"), NO_AXIS]
     rows = (file.values_m[k : k + 4] for k in range(0, file.values_m.size, 4))
     body = "".join("".join(f"{value:20.12E}" for value in row) + "\n" for row in rows)
     with path.open("wb") as out:

@@ -35,15 +35,15 @@ def write_uff58(rows: LogTable, path: Path) -> None:
                 values = np.full(int(index[-1]) - first + 1, np.nan)
                 values[index - first] = rows.read_columns(slice(None), name)[name]
                 shape = f"{4:10d}{values.size:10d}{1:10d}{first * step_s:13.5E}{step_s:13.5E}"
-                axes = [(TIME_CODE, "Time", "s"), make_axis(name, unit), NO_AXIS]
+                axes = [(TIME_CODE, "Time", "s"), describe_axis(name, unit), NO_AXIS]
                 _write_history(file, [name, *texts], shape, axes, values)
         for response in compute_sweep_responses(rows):
             for name, ratio in response.ratios.items():
                 shape = f"{6:10d}{ratio.size:10d}{0:10d}{0.0:13.5E}{0.0:13.5E}"
                 axes = [
                     (FREQUENCY_CODE, "Frequency", "Hz"),
-                    make_axis(name, rows.units[name]),
-                    make_axis(REFERENCE, rows.units[REFERENCE]),
+                    describe_axis(name, rows.units[name]),
+                    describe_axis(REFERENCE, rows.units[REFERENCE]),
                 ]
                 lines = [f"{name}/{REFERENCE} {response.direction}", *texts]
                 pairs = zip(response.frequency_hz.tolist(), ratio.tolist(), strict=True)
@@ -51,7 +51,7 @@ def write_uff58(rows: LogTable, path: Path) -> None:
                 write_text_set(file, 4, lines, shape, axes, body)
 
 
-def make_axis(name: str, unit: str) -> Axis:
+def describe_axis(name: str, unit: str) -> Axis:
     return QUANTITY_CODES.get(unit, GENERAL_CODE), name, unit or "NONE"
 
 
