@@ -481,6 +481,8 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"level has fewer than {rig.output.least_lsb} DAC steps; the response above "
             f"{highest_hz:.3g} Hz is extrapolated"
         )
+    if {"acceleration_g", "level_points"} <= profile.excitation.model_fields_set:
+        messages.append(f"{profile.excitation.kind}: acceleration_g is not used beside level_points")
     messages += rig.backend_section.warnings
     messages += _list_drive_changes(profile, rig)
     block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz

@@ -30,7 +30,7 @@ from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.results.contract import format_json
 from twin.results.contracts import ChannelError, RunSummary
-from twin.results.summary import summarise
+from twin.results.summary import format_summary, summarise
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
@@ -112,6 +112,24 @@ def as_points(forward: list[float], backward: list[float]) -> list[PrcPoint]:
 
 
 # Keys
+
+
+def test_alarms_of_limits_are_stated(
+    recording: Recording, bundle: RunConfig, tmp_path: Path
+) -> None:
+    """Those that stopped nothing, apart from the warnings of the monitoring."""
+    event = Event(1500, "alarm", "limit mass_acc_m_s2: 1.3 g, warned at 1.2 g")
+    items = sorted([*recording.items, event], key=lambda item: item.index)
+    summary = summary_of(items, recording, bundle, tmp_path)
+    assert [(each["at_s"], each["text"]) for each in summary["alarms"]] == [(1.5, event.text)]
+    assert event.text not in [each["text"] for each in summary["warnings"]]
+    assert event.text in format_summary(RunSummary.model_validate(summary), 4)
+
+
+def test_a_sweep_that_measured_nothing_says_so(recording: Recording, bundle: RunConfig) -> None:
+    summary = summarise(recording, bundle.parameters)
+    summary.windows = []
+    assert "complete: nothing measured" in format_summary(summary, 4)
 
 
 def test_the_keys_of_the_contract(recording: Recording, bundle: RunConfig, tmp_path: Path) -> None:

@@ -146,7 +146,7 @@ def _add_summary(row: RunRow, folder: Path, problems: list[str]) -> tuple[RunRow
         jumps=len(summary.jumps),
         twin_jumps=len(summary.twin_jumps),
         hysteresis=len(summary.hysteresis),
-        warnings=len(summary.warnings) if "warnings" in stated else None,
+        warnings=len(summary.warnings + summary.alarms) if "warnings" in stated else None,
         dropouts=summary.gaps if "gaps" in stated else None,
         lost_samples=summary.lost_samples,
         faults=len(summary.faults),

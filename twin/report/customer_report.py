@@ -16,7 +16,7 @@ from matplotlib.image import imread
 
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
-from table_io.records import Event, SampleGap
+from table_io.records import SampleGap
 from table_io.units import GRAVITY_M_S2
 from twin.drawing.page import embed_images, render_page
 from twin.drawing.panels import CaptionedFigure, Picture
@@ -196,10 +196,9 @@ def _list_deviations(run: ReportData) -> list[str]:
             f"The level was reduced for {100 * swept.notched:.3g} % of the time by the limit of "
             f"{', '.join(names)}."
         )
-    alarms = [event for event in recording.records(Event) if event.kind in ("alarm", "sensor")]
-    lines += [f"{event.kind.capitalize()}: {event.text}." for event in alarms[:MAX_ALARMS]]
-    if len(alarms) > MAX_ALARMS:
-        lines.append(f"{len(alarms) - MAX_ALARMS} further alarms are in the recording.")
+    lines += [f"{each.kind.capitalize()}: {each.text}." for each in summary.alarms[:MAX_ALARMS]]
+    if len(summary.alarms) > MAX_ALARMS:
+        lines.append(f"{len(summary.alarms) - MAX_ALARMS} further alarms are in the recording.")
     gaps = recording.records(SampleGap)
     if gaps or recording.missing_samples:
         lines.append(f"{len(gaps)} gaps in the samples, {recording.missing_samples} lost.")

@@ -517,7 +517,7 @@ class ParameterEstimate(Contract):
 
 
 class WarningEntry(Contract):
-    """Warning of the condition monitoring."""
+    """Warning of the condition monitoring, or alarm."""
 
     at_s: Seconds = Field(description="time in the test")
     kind: str = Field(description="kind of the event")
@@ -616,6 +616,9 @@ class RunSummary(Contract):
     comparison: dict[str, ChannelError] = Field({}, description="errors of the twin by channel")
     estimates: dict[str, ParameterEstimate] = Field({}, description="by parameter")
     warnings: list[WarningEntry] = Field([], description="warnings of the condition monitoring")
+    alarms: list[WarningEntry] = Field(
+        [], description="of the protection and of the test's own limits, where they stop nothing"
+    )
     excitation_verdict: ExcitationVerdict | None = Field(
         None, description="whether the table played the test"
     )

@@ -70,6 +70,9 @@ from twin.results.twin_verdict import (
 )
 from twin.results.windows import summarise_windows
 
+WARNING_KINDS = frozenset(EVENT_KINDS) - {"jump"}
+ALARM_KINDS = frozenset({"alarm", "sensor"})
+
 
 def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
     """Compute the summary of a recording whose twin ran with these parameters."""
@@ -155,7 +158,8 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
             recording.records(Comparison), parameters, channels, noise, failed
         ),
         estimates=_list_estimates(recording.records(Estimate)),
-        warnings=_list_warnings(recording, clipped),
+        warnings=_list_events(recording, WARNING_KINDS, clipped),
+        alarms=_list_events(recording, ALARM_KINDS, clipped),
     )
     if not start.steps:
         compare = partial(
@@ -205,8 +209,10 @@ def _describe_run(
     )
 
 
-def _list_warnings(recording: Recording, clipped: Container[int]) -> list[WarningEntry]:
-    """Return the warnings of the monitoring; `clipped` are ends of cycles with a clipped sensor."""
+def _list_events(
+    recording: Recording, kinds: Container[str], clipped: Container[int]
+) -> list[WarningEntry]:
+    """Return the events of some kinds; `clipped` are ends of cycles with a clipped sensor."""
     return [
         WarningEntry(
             at_s=event.index / recording.start.rate_hz,
@@ -215,7 +221,7 @@ def _list_warnings(recording: Recording, clipped: Container[int]) -> list[Warnin
             is_clipped=event.index in clipped,
         )
         for event in recording.records(Event)
-        if event.kind in EVENT_KINDS and event.kind != "jump"
+        if event.kind in kinds
     ]
 
 
@@ -425,18 +431,21 @@ def _compared_noise(noise: ChannelNoise, name: str) -> float:
     return noise.relative_displacement_rms if name == "rel_disp_m" else noise.channel_rms(name)
 
 
-def format_summary(summary: RunSummary, planned: int) -> str:
-    """Format the result of a run of `planned` steps or orbits in one line."""
+def _format_extent(summary: RunSummary, planned: int) -> str:
+    """Format what of `planned` steps or orbits was measured."""
     if summary.orbits is not None:
         accepted = sum(orbit.accepted for orbit in summary.orbits)
-        done = f"{accepted} of {planned} orbits measured"
-    elif summary.swept_sine is not None:
-        done = format_swept_sine(summary.swept_sine)
-    elif summary.windows is not None:
-        done = f"{len(summary.windows)} windows"
-    else:
-        done = f"{len(summary.steps)} steps"
-    parts = [f"{summary.verdict}: {done}"]
+        return f"{accepted} of {planned} orbits measured"
+    if summary.swept_sine is not None:
+        return format_swept_sine(summary.swept_sine)
+    if summary.windows is not None:
+        return f"{len(summary.windows)} windows" if summary.windows else "nothing measured"
+    return f"{len(summary.steps)} steps"
+
+
+def format_summary(summary: RunSummary, planned: int) -> str:
+    """Format the result of a run of `planned` steps or orbits in one line."""
+    parts = [f"{summary.verdict}: {_format_extent(summary, planned)}"]
     if summary.tracking:
         parts.append(format_tracking(summary.tracking))
     if summary.visits:
@@ -455,6 +464,8 @@ def format_summary(summary: RunSummary, planned: int) -> str:
     parts.append(f"{summary.gaps} dropouts")
     if summary.faults:
         parts.append(f"{len(summary.faults)} faults")
+    if summary.alarms:
+        parts.append(f"{len(summary.alarms)} alarms, the first: {summary.alarms[0].text}")
     if summary.verdict != "complete":
         parts.append(summary.reason)
     return "; ".join(parts)

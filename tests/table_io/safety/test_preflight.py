@@ -588,3 +588,11 @@ def test_command_may_be_doubled_and_no_more(gain: float, count: int) -> None:
     assert len(warnings) == count
     part = "step 0 (5 Hz forward): the table follows with a gain of 0.5"
     assert all(warning.startswith(part) for warning in warnings)
+
+
+def test_a_level_beside_break_points_is_not_ignored_silently() -> None:
+    keys: dict[str, Any] = {"start_hz": 0.4, "stop_hz": 5.0, "duration_s": 20.0}
+    points = {"level_points": [[0.4, 0.02], [5.0, 0.02]]}
+    for level, count in (({}, 0), ({"acceleration_g": 0.05}, 1)):
+        test = make_history_profile("chirp", **keys, **points, **level)
+        assert sum("level_points" in text for text in list_setup_warnings(test, RIG)) == count
