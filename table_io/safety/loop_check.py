@@ -67,6 +67,9 @@ MIN_IN_PHASE_TONE = 0.5
 MAX_ANTIPHASE_TONE = 0.9
 
 
+MIN_FLOOR_MOTION = 0.3  # of the table's tone, in what the laser of the mass reads
+
+
 def make_check(
     data: LoopCheckData, name: str, channel: str, value: float, low: float, high: float, unit: str
 ) -> Check:
@@ -185,14 +188,40 @@ def unwrap_phase(tones: Complex1D, frequencies_hz: Float1D) -> Float1D:
     return phase
 
 
+def check_laser_mount(data: LoopCheckData) -> Iterator[Check]:
+    """Check that the laser of the mass stands on the floor, where its accelerometer can tell.
+
+    On the table it reads the tone of the mass less that of the table. The value is the largest
+    distance from that over the table's tone: 1 on the floor, 0 on the table.
+    """
+    if _has_clear_tone(data, "table_acc_m_s2", "mass_acc_m_s2", "mass_disp_m"):
+        table, mass = data.tones("table_acc_m_s2"), data.tones("mass_acc_m_s2")
+        distance = np.abs((data.tones("mass_disp_m") - mass) / table + 1.0).max()
+        yield make_check(
+            data,
+            "motion against the floor",
+            "mass_disp_m",
+            distance,
+            MIN_FLOOR_MOTION,
+            math.inf,
+            "",
+        )
+
+
 def check_mass_polarity(data: LoopCheckData) -> Iterator[Check]:
     """Check the polarity of the sensors of the mass without a model of the specimen."""
-    for name in filter(data.has, MASS_CHANNELS):
+    for name in _list_absolute(data, MASS_CHANNELS):
         sine_of_lag = lag_sine(data, name)
         if sine_of_lag is not None:
             yield make_check(
                 data, "polarity, lag behind the table", name, sine_of_lag, 0.0, 1.0, ""
             )
+
+
+def _list_absolute(data: LoopCheckData, names: Iterable[str]) -> list[str]:
+    """Return the channels that the rig has, but a laser that looks mounted on the table."""
+    on_table = {check.channel for check in check_laser_mount(data) if not check.passed}
+    return [name for name in filter(data.has, names) if name not in on_table]
 
 
 def lag_sine(data: LoopCheckData, name: str) -> float | None:
@@ -229,6 +258,8 @@ def check_derivative_consistency(data: LoopCheckData) -> Iterator[Check]:
     """
     for displacements, acceleration in SENSOR_PAIRS:
         if not _has_clear_tone(data, *displacements, acceleration):
+            continue
+        if displacements[0] == "mass_disp_m" and not _list_absolute(data, displacements[:1]):
             continue
         mismatch, _ = data.compare_sensors(displacements, acceleration)
         if not math.isnan(mismatch):
@@ -473,6 +504,7 @@ CHECK_FUNCTIONS = (
     check_alive,
     check_read_back,
     check_table_response,
+    check_laser_mount,
     check_mass_polarity,
     check_derivative_consistency,
     check_noise,
@@ -491,6 +523,8 @@ REMEDIES = {
     "delay": "check filters and the clocks of output and input",
     "second derivative": "check gain, unit, sign, filter and input of both sensors; they may be "
     "swapped",
+    "motion against": "the laser looks mounted on the table, it reads mass minus table: state its "
+    'channel as "rel_disp_m" in the rig file, or mount it on the floor',
     "noise": "check for ground loops and the range, or raise the level of the excitation",
     "offset": "tare again with the table at rest and the bumpers unloaded",
     "preload of": "tare with the bumpers clear of the mass (shaketwin tare), else correct the "

@@ -482,7 +482,8 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"{highest_hz:.3g} Hz is extrapolated"
         )
     if {"acceleration_g", "level_points"} <= profile.excitation.model_fields_set:
-        messages.append(f"{profile.excitation.kind}: acceleration_g is not used beside level_points")
+        kind = profile.excitation.kind
+        messages.append(f"{kind}: acceleration_g is not used beside level_points")
     messages += rig.backend_section.warnings
     messages += _list_drive_changes(profile, rig)
     block_s = profile.acquisition.block_samples / profile.acquisition.rate_hz

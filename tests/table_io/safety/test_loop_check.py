@@ -304,6 +304,15 @@ def test_planted_fault_fails_its_lines(fault: str) -> None:
     assert list_failures("g4_ss3", changes) == lines
 
 
+@pytest.mark.parametrize("name", ["g4_ss3", "ginf", "gm1"])
+def test_mass_laser_on_the_table_is_told_from_a_reversed_one(name: str) -> None:
+    """One line names it; those that would blame its sign or its gain are left out."""
+    table = record_loop_check(name)[1].channel("table_disp_m")
+    lines = {("motion against the floor", "mass_disp_m")}
+    assert list_failures(name, {"mass_disp_m": lambda values: values - table}) == lines
+    assert "rel_disp_m" in REMEDIES["motion against"]
+
+
 @pytest.mark.parametrize("cell", CELLS)
 def test_load_cell_shows_its_sign_and_its_death_in_contact_only(cell: str) -> None:
     only_noise: Change = lambda values: make_white(1.0)(0 * values)  # noqa: E731
