@@ -49,6 +49,7 @@ LOAD_CELLS = RIGHT_CELLS + LEFT_CELLS
 NOISY = MOTION_CHANNELS + LOAD_CELLS
 
 MAX_LOST_PERCENT = 1.0  # of the samples
+MIN_NEW_PERCENT = 70.0  # of the samples: noise of two converter steps repeats 14 % of them
 MIN_TONE_SNR = 10.0  # tone over its standard error
 DELAY_RANGE_MS = (-2.0, 100.0)
 MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
@@ -100,6 +101,22 @@ def check_alive(data: LoopCheckData) -> Iterator[Check]:
         yield make_check(
             data, "alive, tone over noise", name, data.tone_snr(name), low, math.inf, ""
         )
+
+
+def check_sample_rate(data: LoopCheckData) -> Iterator[Check]:
+    """Check that a channel whose noise its converter resolves has a new value at every sample.
+
+    One that is sampled at a lower rate repeats each value; one that never changes is dead.
+    """
+    is_moving = np.zeros(len(data.block), dtype=bool)
+    for window in map(data.window, data.holds):
+        is_moving[window.index - data.block.index : window.end - data.block.index] = True
+    for name in filter(data.has, NOISY):
+        sensor = data.rig.sensor(name)
+        changes = np.diff(data.block.channel(name))[is_moving[1:]] != 0
+        if sensor.noise_si > 2.0 * sensor.lsb_si and changes.any():
+            share = 100.0 * float(changes.mean())
+            yield make_check(data, "new samples", name, share, MIN_NEW_PERCENT, 100.0, "%")
 
 
 def check_read_back(data: LoopCheckData) -> Iterator[Check]:
@@ -501,6 +518,7 @@ MIN_FREQUENCY_RATIO = 1.1  # closer frequencies are merged
 MAX_CANCELLED_ORDER = 5  # highest harmonic of the table that may be canceled
 CHECK_FUNCTIONS = (
     check_lost_samples,
+    check_sample_rate,
     check_alive,
     check_read_back,
     check_table_response,
@@ -513,6 +531,8 @@ CHECK_FUNCTIONS = (
 )
 REMEDIES = {
     "lost samples": "check the cable and the acquisition device",
+    "new samples": "the channel is sampled at a lower rate than the test: raise its rate, or lower "
+    "acquisition.rate_hz",
     "alive": "check the cable, supply and range of the sensor",
     "command read back": "connect the command output to its input, and check span_mm and span_v of "
     "the output",

@@ -21,12 +21,7 @@ from twin.paper.slow_passage import (
     choose_effort,
 )
 from twin.results.paper_cases import PaperCase
-from twin.results.players import (
-    FINE_SAMPLES_PER_CYCLE,
-    HarmonicSimulator,
-    SystemMotion,
-    make_simulator,
-)
+from twin.results.players import HarmonicSimulator, SystemMotion, make_simulator
 
 # Limit and tolerance of the search for permanent contact.
 MIN_GAP_MM = -40.0
@@ -35,7 +30,7 @@ MAX_HYSTERESIS_HZ = 2.0  # from a frequency within a hysteresis to its end
 BRANCH_MARGIN_HZ = 0.5  # by which a branch is followed beyond a hysteresis
 MIN_BAND_VALUE = 0.05  # of an exponent or a share in a band of a curve
 SETTLE_CYCLES = 400  # cycles until the motion is steady
-FLIGHT_CYCLES = 4  # cycles over which the shares of contact are measured
+FLIGHT_CYCLES = 4  # cycles over which the share of flight is measured
 FLIGHT_SAMPLES = 40000  # of such a cycle: a share is known to 0.01 %
 
 
@@ -171,18 +166,13 @@ def steady_amplitude_m(
 
 
 def simulate_steady_motion(
-    case: PaperCase,
-    sweep: SlowSweep,
-    frequency_hz: float,
-    direction: str,
-    cycles: int,
-    samples: int = FINE_SAMPLES_PER_CYCLE,
+    case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str, cycles: int
 ) -> SystemMotion:
     """Simulate the steady motion that slow passage in this direction leads to."""
     a, simulator = case.acceleration, case.simulator
     start = sweep.state_at(frequency_hz, direction)
     state = simulator.sweep([frequency_hz], a, SETTLE_CYCLES, start).states[0]
-    return simulator.simulate_motion(frequency_hz, a, state, cycles, samples)
+    return simulator.simulate_motion(frequency_hz, a, state, cycles)
 
 
 def find_permanent_contact_mm(case: PaperCase) -> float:
@@ -265,7 +255,8 @@ def _measure_flight(
 ) -> tuple[float, float]:
     """Return (share of flight, right deformation at release over its largest)."""
     state = simulator.sweep([hz], acceleration, SETTLE_CYCLES).states[0]
-    motion = simulator.simulate_motion(hz, acceleration, state, FLIGHT_CYCLES, FLIGHT_SAMPLES)
+    simulator = replace(simulator, fine_samples=FLIGHT_SAMPLES)
+    motion = simulator.simulate_motion(hz, acceleration, state, FLIGHT_CYCLES)
     in_flight = (motion.force_r <= 0) & (motion.force_l >= 0)
     force, deformation = motion.force_r, motion.v_r - simulator.parameters.gap_r
     last = np.flatnonzero((force[1:-1] > 0) & (force[2:] <= 0)) + 1  # samples of each contact
@@ -278,7 +269,7 @@ def measure_contact_shares(
     case: PaperCase, sweep: SlowSweep, frequency_hz: float, direction: str
 ) -> tuple[float, float, float]:
     """Return the shares of the time in contact with both bumpers, one, none, in steady motion."""
-    motion = simulate_steady_motion(case, sweep, frequency_hz, direction, 1, FLIGHT_SAMPLES)
+    motion = simulate_steady_motion(case, sweep, frequency_hz, direction, 1)
     contacts = (motion.force_r > 0).astype(int) + (motion.force_l < 0)
     both, single, none = (float((contacts == count).mean()) for count in (2, 1, 0))
     return both, single, none

@@ -814,8 +814,8 @@ def _find_backward_contact(study: PaperStudy) -> ModelFinding | None:
     shares = findings.measure_contact_shares(case, study.slow_sweeps["G-1"], hz, "backward")
     both, single, none = shares
     return ModelFinding(
-        f"in contact with both bumpers for {100 * both:.2f} % of the time, with one for "
-        f"{100 * single:.2f} %, with none for {100 * none:.2f} %",
+        f"in contact with both bumpers for {100 * both:.1f} % of the time, with one for "
+        f"{100 * single:.1f} %, with none for {100 * none:.1f} %",
         _judge(both > 0 and single > 0 and none == 0),
         {"shares": [*shares]},
         hz,

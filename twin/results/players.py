@@ -50,10 +50,12 @@ class SystemMotion:
 class HarmonicSimulator(ABC):
     """Simulator of a model under table acceleration A = a sin(2 pi f t).
 
-    States refer to a zero upcrossing of A; a given state vector is not modified.
+    States refer to a zero upcrossing of A; a given state vector is not modified. `fine_samples`:
+    of each cycle of a sampled motion.
     """
 
     model: Model
+    fine_samples: int = FINE_SAMPLES_PER_CYCLE
 
     @property
     def parameters(self) -> Parameters:
@@ -82,14 +84,9 @@ class HarmonicSimulator(ABC):
 
     @abstractmethod
     def sample(
-        self,
-        frequency_hz: float,
-        acceleration: float,
-        state: Float1D,
-        cycles: int,
-        samples: int = FINE_SAMPLES_PER_CYCLE,
+        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> Float2D:
-        """Return u, v, total acceleration, F_R, F_L, u_R, u_L in SI, (7, cycles x samples)."""
+        """Return u, v, total acceleration, F_R, F_L, u_R, u_L in SI, (7, sample)."""
 
     @abstractmethod
     def find_onsets(
@@ -104,19 +101,14 @@ class HarmonicSimulator(ABC):
         """Return (largest Lyapunov exponent per cycle, final state) from a settled state."""
 
     def simulate_motion(
-        self,
-        frequency_hz: float,
-        acceleration: float,
-        state: Float1D,
-        cycles: int,
-        samples: int = FINE_SAMPLES_PER_CYCLE,
+        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> SystemMotion:
-        """Simulate the motion from a state; by default sampled for a figure."""
-        p = self.parameters
+        """Simulate the motion from a state, sampled for a figure."""
+        p, rate = self.parameters, frequency_hz * self.fine_samples
         u, v, acc, force_r, force_l, u_r, u_l = self.sample(
-            frequency_hz, acceleration, state, cycles, samples
+            frequency_hz, acceleration, state, cycles
         )
-        time = np.arange(u.size) / (frequency_hz * samples)
+        time = np.arange(u.size) / rate
         return SystemMotion(time, u, v, acc, force_r, force_l, u_r + p.gap_r, u_l - p.gap_l)
 
     def bumper_preload(self) -> dict[str, float]:
@@ -146,19 +138,14 @@ class ClosedFormSimulator(HarmonicSimulator):
         )
 
     def sample(
-        self,
-        frequency_hz: float,
-        acceleration: float,
-        state: Float1D,
-        cycles: int,
-        samples: int = FINE_SAMPLES_PER_CYCLE,
+        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> Float2D:
-        count = cycles * samples
-        base = acceleration * np.sin(2 * math.pi * np.arange(1, count + 1) / samples)
+        count = cycles * self.fine_samples
+        base = acceleration * np.sin(2 * math.pi * np.arange(1, count + 1) / self.fine_samples)
         out = np.empty((OUTPUT_COUNT, count))
         closed_form.advance_state(
             state.copy(),
-            closed_form.discretized_params(self.parameters, frequency_hz * samples),
+            closed_form.discretized_params(self.parameters, frequency_hz * self.fine_samples),
             base,
             out,
         )
@@ -235,14 +222,9 @@ class NumericalSimulator(HarmonicSimulator):
         return SteppedSineResponse(extremes, np.array(ends))
 
     def sample(
-        self,
-        frequency_hz: float,
-        acceleration: float,
-        state: Float1D,
-        cycles: int,
-        samples: int = FINE_SAMPLES_PER_CYCLE,
+        self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int
     ) -> Float2D:
-        return self._advance(frequency_hz, acceleration, state.copy(), cycles, samples)
+        return self._advance(frequency_hz, acceleration, state.copy(), cycles, self.fine_samples)
 
     def find_onsets(
         self, frequency_hz: float, acceleration: float, state: Float1D, cycles: int

@@ -304,6 +304,13 @@ def test_planted_fault_fails_its_lines(fault: str) -> None:
     assert list_failures("g4_ss3", changes) == lines
 
 
+@pytest.mark.parametrize("every", [2, 10])
+@pytest.mark.parametrize("channel", ["mass_disp_m", "table_acc_m_s2", "force_l1_n"])
+def test_channel_of_a_lower_rate_is_named(channel: str, every: int) -> None:
+    hold: Change = lambda values: np.repeat(values[::every], every)[: values.size]  # noqa: E731
+    assert ("new samples", channel) in list_failures("g4_ss3", {channel: hold})
+
+
 @pytest.mark.parametrize("name", ["g4_ss3", "ginf", "gm1"])
 def test_mass_laser_on_the_table_is_told_from_a_reversed_one(name: str) -> None:
     """One line names it; those that would blame its sign or its gain are left out."""

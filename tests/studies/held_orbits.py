@@ -1,0 +1,217 @@
+"""Continuations and backbones: starts anywhere, the bound that `check` states, stops on the way.
+
+    python -m tests.studies.held_orbits starts --count 40     start_hz over 2.75 to 4.1 Hz, two rigs
+    python -m tests.studies.held_orbits bounds --count 20     profiles, on each of three rigs
+    python -m tests.studies.held_orbits stops --count 60      stop and abort at random samples
+
+The command is read where it is written to the rig, so its acceleration is exact.
+"""
+
+import argparse
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from table_io.acquisition.session import OperatorCommand, find_take_back, run_session
+from table_io.backends import open_backend
+from table_io.block import Block, Float1D
+from table_io.clock import ManualClock
+from table_io.errors import InputError
+from table_io.records import OrbitPoint, RunStop
+from table_io.units import GRAVITY_M_S2
+from twin.setup.run_config import RunConfig, read_run_config
+
+RIGS = ("simulated", "hydraulic", "slow_clock")
+PROFILE = """
+title = "held orbits"
+rig = "{rig}"
+model = "snm"
+[specimen]
+mass_kg = 550.0
+gap_mm = {gap}
+[excitation]
+kind = "{kind}"
+start_hz = {start}
+stop_hz = {stop}
+acceleration_g = {level}
+points = {points}
+{extra}
+"""
+REST_M = 1e-6
+
+
+@dataclass(frozen=True)
+class HeldTest:
+    """A played test: its orbits, how it ended, the command in m, and what `check` bounds."""
+
+    accepted: int
+    planned: int
+    verdict: str
+    reason: str
+    command_m: Float1D
+    rate_hz: float
+    bound_m_s2: float
+    level_m_s2: float
+    is_whole: bool  # every sample was delivered
+
+    @property
+    def peak_m_s2(self) -> float:
+        return float(np.abs(np.diff(self.command_m, 2)).max() * self.rate_hz**2)
+
+    def rests(self, within_s: float, from_sample: int) -> bool:
+        """Return whether the command is at rest so soon after a sample, and stays there."""
+        moving = np.flatnonzero(np.abs(self.command_m) > REST_M)
+        return bool(moving[-1] < from_sample + within_s * self.rate_hz)
+
+
+def play(
+    config: RunConfig, operate: Callable[[int], OperatorCommand | None] = lambda _: None
+) -> HeldTest:
+    """Play a test unpaced. `operate` is asked with the number of samples so far."""
+    clock, rig = ManualClock(), config.rig
+    backend = open_backend(rig, config.profile, clock)
+    written = np.zeros(1 << 20)
+    queue = backend.queue
+
+    def record(index: int, volts: Float1D) -> None:
+        nonlocal written
+        while index + volts.size > written.size:
+            written = np.concatenate([written, np.zeros(written.size)])
+        written[index : index + volts.size] = volts
+        written[index + volts.size :] = volts[-1]  # held until more is queued
+        queue(index, volts)
+
+    backend.queue = record  # type: ignore[method-assign]
+    progress = [0]  # samples so far
+    accepted, stop, is_whole = 0, None, True
+    for item in run_session(
+        config.session_setup, backend, clock, config.make_start_factory("held", "table"),
+        lambda: operate(progress[0]), take_back=find_take_back(backend, clock),
+    ):  # fmt: skip
+        if isinstance(item, Block):
+            is_whole &= item.index == progress[0]
+            progress[0] = item.end
+        elif isinstance(item, OrbitPoint):
+            accepted += item.accepted
+        elif isinstance(item, RunStop):
+            stop = item
+    assert stop is not None
+    end = progress[0]
+    bound = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
+    continuation = config.profile.continuation
+    assert continuation is not None
+    command_m = written[:end] * rig.output.span_mm * 1e-3 / rig.output.span_v
+    return HeldTest(
+        accepted, len(continuation.orbit_plan.points), stop.verdict, stop.reason, command_m,
+        config.drive.rate_hz, bound, continuation.acceleration_g * GRAVITY_M_S2,
+        is_whole and stop.index == end,
+    )  # fmt: skip
+
+
+def read(folder: Path, rig: str = "simulated", **keys: object) -> RunConfig:
+    values = {"gap": 4.0, "kind": "continuation", "start": 2.75, "stop": 4.1, "level": 0.05,
+              "points": 4, "extra": "", **keys}  # fmt: skip
+    if rig == "slow_clock":
+        rig, values["extra"] = "simulated", f"{values['extra']}\n[acquisition]\nrate_hz = 1000.0"
+    path = folder / "held.toml"
+    path.write_text(PROFILE.format(rig=rig, **values))
+    return read_run_config(path)
+
+
+def try_starts(folder: Path, count: int, points: int) -> None:
+    reached = refused = 0
+    starts = np.linspace(2.75, 4.1, count)
+    for index, start in enumerate(starts.tolist()):
+        for rig in RIGS[:2]:
+            try:
+                config = read(folder, rig, start=round(start, 3), stop=4.2, points=points,
+                              extra="multiplier_periods = 0")  # fmt: skip
+                test = play(config)
+            except InputError as error:
+                refused += 1
+                print(f"{index:>3} {rig} {start:.3f} Hz refused: {error}", flush=True)
+                continue
+            is_reached = test.accepted >= 0.95 * test.planned
+            reached += is_reached
+            print(
+                f"{index:>3} {rig} {start:.3f} Hz {test.accepted} of {test.planned}, "
+                f"{test.verdict} {test.reason if not is_reached else ''}",
+                flush=True,
+            )
+    print(f"{reached} reached, {refused} refused before motion, of {2 * count}")
+
+
+def try_bounds(folder: Path, count: int, seed: int) -> None:
+    rng, ratios, above = np.random.default_rng(seed), [], 0
+    for index in range(count):
+        kind = "backbone" if index % 3 == 2 else "continuation"
+        level = round(float(rng.uniform(0.03, 0.06)), 4)
+        gap = round(float(rng.uniform(3.5, 5.0)), 2)
+        keys = {"kind": kind, "level": level, "gap": gap, "points": int(rng.integers(2, 5))}
+        if kind == "backbone":
+            keys |= {"start": 1.3, "stop": 4.5, "extra": f"min_acceleration_g = {0.6 * level:.4f}"}
+        for rig in RIGS:
+            try:
+                config = read(folder, rig, **keys)
+                test = play(config)
+            except InputError as error:
+                print(f"{index:>3} {rig} {keys} refused: {error}", flush=True)
+                continue
+            ratios.append(test.bound_m_s2 / test.level_m_s2)
+            above += test.peak_m_s2 > test.bound_m_s2
+            print(
+                f"{index:>3} {rig} {kind} {level:g} g, {gap:g} mm: peak "
+                f"{test.peak_m_s2 / test.level_m_s2:.3f}, bound {ratios[-1]:.3f} of the level, "
+                f"{test.accepted} of {test.planned}, {test.verdict}",
+                flush=True,
+            )
+    print(f"{len(ratios)} played, {above} above the bound, bound at most {max(ratios):.3f}")
+
+
+def try_stops(folder: Path, count: int, seed: int) -> None:
+    rng, bad = np.random.default_rng(seed), 0
+    config = read(folder, points=3)
+    for index in range(count):
+        at_s, name = float(rng.uniform(8.0, 90.0)), ("stop", "abort")[index % 2]
+        asked: list[int] = []
+
+        def operate(end: int, at_s: float = at_s, name: str = name, asked: list[int] = asked
+                    ) -> OperatorCommand | None:  # fmt: skip
+            if end < at_s * config.drive.rate_hz or asked:
+                return None
+            asked.append(end)
+            return OperatorCommand(name, "study")
+
+        test = play(config, operate)
+        since = asked[0] if asked else test.command_m.size
+        is_good = test.rests(5.0, since) and test.peak_m_s2 <= test.bound_m_s2 and test.is_whole
+        bad += not is_good
+        print(
+            f"{index:>3} {name} at {at_s:.2f} s: {'good' if is_good else 'WRONG'}, peak "
+            f"{test.peak_m_s2 / test.bound_m_s2:.3f} of the bound, {test.verdict}",
+            flush=True,
+        )
+    print(f"{bad} of {count} wrong")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=("starts", "bounds", "stops"))
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--points", type=int, default=12)
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    with TemporaryDirectory() as name:
+        if options.what == "starts":
+            try_starts(Path(name), options.count, options.points)
+        elif options.what == "bounds":
+            try_bounds(Path(name), options.count, options.seed)
+        else:
+            try_stops(Path(name), options.count, options.seed)
+
+
+if __name__ == "__main__":
+    main()
