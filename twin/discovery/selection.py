@@ -235,9 +235,9 @@ class RoundEffort:
     """How far a round of a search goes: sets of so many effects, and which of them are refitted.
 
     Those within so many nats of the most probable, and no more than `max_refits`. With a `share`
-    within that of its log evidence, and without a stranger: where shapes are free, as those of laws
-    are, a ladder of them promises little. With `if_open` a round is left out where a set of those
-    before leaves noise alone.
+    within that of its log evidence, and without a stranger, until one leaves noise alone: where
+    shapes are free, as those of laws are, a ladder of them promises little. With `if_open` a round
+    is left out where a set of those before leaves noise alone.
     """
 
     stage: str = "the most probable sets"
@@ -305,10 +305,10 @@ def _advance(
     linear = build_evidence(
         problem.log_residuals, base, problem.library, known_shapes, rich, problem.mapper
     )
-    promised = linear.rank_states(effort.max_effects)
+    promised, share = linear.rank_states(effort.max_effects), effort.share
     for index in range(1, effort.max_refits + 1):
         states = _correct_by_refits(linear, promised, refitted, state.null)
-        each = _find_open(linear, states, refitted, effort.share)
+        each = _find_open(linear, states, refitted, share)
         if each is None:
             break
         variants = [linear.variants[c] for c in each.columns]
@@ -318,7 +318,9 @@ def _advance(
         for variant, amplitude in zip(variants, linear.estimate(each.columns)[0], strict=True):
             parameters = variant.add_to(parameters, float(amplitude))
         effects = tuple(variant.candidate for variant in variants)
-        refitted[frozenset(names)] = problem.fit_effects(parameters, effects)
+        refitted[frozenset(names)] = fitted = problem.fit_effects(parameters, effects)
+        if share and problem.leaves_noise(fitted):
+            share = 0.0
     states = _correct_by_refits(linear, promised, refitted, state.null)
     best = next(refitted[linear.names(each)] for each in states if linear.names(each) in refitted)
     explanations = tuple(
