@@ -52,7 +52,8 @@ def draw_residual_forces(view: DiscoveryView) -> CaptionedFigures:
     }
     bumpers = _draw_bumpers(view, residuals, sides, list(close_ups.values())[:4])
     squares = np.nansum(_forces(view).law ** 2, axis=1)
-    for drawn in (bumpers, damper) if squares[0] < squares[1:].sum() else (damper, bumpers):
+    in_bumpers = squares[0] < squares[1:].sum() or "bumper" in view.discovery.verdict.place
+    for drawn in (bumpers, damper) if in_bumpers else (damper, bumpers):
         yield from drawn
 
 
