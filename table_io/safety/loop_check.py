@@ -50,6 +50,7 @@ NOISY = MOTION_CHANNELS + LOAD_CELLS
 
 MAX_LOST_PERCENT = 1.0  # of the samples
 MIN_NEW_PERCENT = 70.0  # of the samples: noise of two converter steps repeats 14 % of them
+MIN_STEPS_OF_CHANGE = 4.0  # usual change of a channel over its step, from which it repeats few
 MIN_TONE_SNR = 10.0  # tone over its standard error
 DELAY_RANGE_MS = (-2.0, 100.0)
 MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
@@ -104,19 +105,21 @@ def check_alive(data: LoopCheckData) -> Iterator[Check]:
 
 
 def check_sample_rate(data: LoopCheckData) -> Iterator[Check]:
-    """Check that a channel whose noise its converter resolves has a new value at every sample.
+    """Check that a channel whose motion its converter resolves has a new value at every sample.
 
-    One that is sampled at a lower rate repeats each value; one that never changes is dead.
+    One that is sampled at a lower rate repeats each value; one that never changes is dead. The
+    step is the smallest change of a motion: a rig file may state more bits than the converter has.
     """
-    is_moving = np.zeros(len(data.block), dtype=bool)
-    for window in map(data.window, data.holds):
-        is_moving[window.index - data.block.index : window.end - data.block.index] = True
+    windows = [data.window(hold) for hold in data.holds]
     for name in filter(data.has, NOISY):
-        sensor = data.rig.sensor(name)
-        changes = np.diff(data.block.channel(name))[is_moving[1:]] != 0
-        if sensor.noise_si > 2.0 * sensor.lsb_si and changes.any():
-            share = 100.0 * float(changes.mean())
-            yield make_check(data, "new samples", name, share, MIN_NEW_PERCENT, 100.0, "%")
+        shares = []
+        for window in windows:
+            changes = np.abs(np.diff(window.channel(name)))
+            steps = changes[changes > 0.0]
+            if steps.size and np.median(steps) > MIN_STEPS_OF_CHANGE * float(steps.min()):
+                shares.append(100.0 * steps.size / changes.size)
+        if shares:
+            yield make_check(data, "new samples", name, min(shares), MIN_NEW_PERCENT, 100.0, "%")
 
 
 def check_read_back(data: LoopCheckData) -> Iterator[Check]:

@@ -311,6 +311,14 @@ def test_channel_of_a_lower_rate_is_named(channel: str, every: int) -> None:
     assert ("new samples", channel) in list_failures("g4_ss3", {channel: hold})
 
 
+@pytest.mark.parametrize("channel", ["mass_disp_m", "force_l1_n"])
+def test_converter_of_fewer_bits_than_stated_is_no_lower_rate(channel: str) -> None:
+    """Noise of two thirds of a step repeats more than half of the values."""
+    step = 1.5 * RIG.sensor(channel).noise_si
+    coarse: Change = lambda values: step * np.round(values / step)  # noqa: E731
+    assert ("new samples", channel) not in list_failures("g4_ss3", {channel: coarse})
+
+
 @pytest.mark.parametrize("name", ["g4_ss3", "ginf", "gm1"])
 def test_mass_laser_on_the_table_is_told_from_a_reversed_one(name: str) -> None:
     """One line names it; those that would blame its sign or its gain are left out."""
