@@ -45,6 +45,7 @@ from twin.results.windows import cut_blocks, extract_free_twin, join_channel
 HISTORY_CYCLES = 3
 CONTACT_ALPHAS = 0.22, 0.10  # right, left
 BAND_COLOUR = "#cfe8d5"
+MIN_LEVEL_M_S2 = 1e-6  # that is drawn: a distortion below its noise is 0
 
 
 def draw_legend(run: ReportData, figure: PanelFigure, *keys: Key, marker: str = "") -> None:
@@ -307,6 +308,40 @@ def _join(
 
 
 TOLERANCE_COLOUR, PREDICTED_COLOUR = "#e9edf3", "#2e9e5b"
+
+
+def draw_best_linear(run: ReportData) -> CaptionedFigures:
+    """Draw the best linear approximations of table and specimen, and what is noise in them."""
+    results = run.summary.best_linear
+    if not results:
+        return
+    figure = PanelFigure((FIGURE_WIDTH_IN, 5.4), 2, len(results), heights=(1.4, 1.0))
+    for column, result in enumerate(results):
+        gain, level = figure.panels[:, column]
+        hz, known, half = np.array([result.frequency_hz, result.gain, result.half_width])
+        gain.fill_between(hz, known - half, known + half, color=BAND_COLOUR, lw=0)
+        gain.plot(hz, known, **measured_style("forward"))
+        gain.set_title(f"{result.output} over {result.input}")
+        for values, label, colour in (
+            (result.level_m_s2, "acceleration", DIRECTION_COLOURS["forward"]),
+            (result.distortion_m_s2, "nonlinear distortion", DIRECTION_COLOURS["backward"]),
+            (result.noise_m_s2, "noise", GUIDE_COLOUR),
+        ):
+            decibels = 20.0 * np.log10(np.maximum(values, MIN_LEVEL_M_S2))
+            label_once = {} if column else {"label": label}
+            level.plot(hz, decibels, color=colour, lw=0.9, **label_once)
+        for axis in (gain, level):
+            axis.set_xscale("log")
+        level.set_xlabel("frequency in Hz")
+    figure.panels[0, 0].set_ylabel("gain")
+    figure.panels[1, 0].set_ylabel("dB re 1 m/s²")
+    figure.panels[1, 0].legend()
+    caption = (
+        "Above: best linear approximation with the circle of 95 % about it. Below, by excited "
+        "line: the acceleration, what in it changes with the phases of the excitation (nonlinear "
+        "distortion), and what changes from period to period (noise)."
+    )
+    yield CaptionedFigure("best_linear", "Best linear approximation", caption, figure)
 
 
 def draw_swept_sine(run: ReportData) -> CaptionedFigures:

@@ -49,6 +49,7 @@ from twin.earthquakes.table_judgement import (
 )
 from twin.earthquakes.table_response import CROSSOVER_HZ, BandProjection, PredictiveModel
 from twin.recording.reader import Recording
+from twin.results.best_linear import COMMAND, estimate_best_linear
 from twin.results.recordings import build_provenance, open_recording
 from twin.results.tracking import find_band
 from twin.setup.run_config import RunConfig, build_run_config
@@ -96,7 +97,7 @@ def identify_table(
             raise InputError("is fitted, and cannot judge", where=recording.path)
     logs = [_read_named_motion(*pair) for pair in zip(paths, recordings, strict=True)]
     judges = [_read_named_motion(*pair) for pair in zip(options.judge, judging, strict=True)]
-    band_hz = options.band_hz or find_predictable_band(logs)
+    band_hz = options.band_hz or _find_band(recordings, logs)
     highest_hz = MAX_RATE_SHARE * min(log.motion.rate_hz for log in (*logs, *judges))
     if not 0.0 < band_hz[0] < band_hz[1] <= highest_hz:
         raise InputError(
@@ -141,6 +142,21 @@ def identify_table(
         logs[0].motion,
         build_provenance({recording.path: recording.start for recording in recordings}),
     )
+
+
+def _find_band(recordings: Sequence[Recording], logs: Sequence[NamedMotion]) -> tuple[float, float]:
+    """Return the band in Hz in which a twin can promise anything, and refuse what says nothing.
+
+    Without a multisine it is that of the coherence, to which distortion is noise.
+    """
+    band_hz = find_predictable_band(logs)
+    bands = [
+        result.band_hz
+        for recording in recordings
+        for result in estimate_best_linear(recording, _read_profile(recording))
+        if result.input == COMMAND and result.band_hz is not None
+    ]
+    return min(bands, default=band_hz, key=lambda band: band[0] - band[1])
 
 
 def _read_named_motion(path: Path, recording: Recording) -> NamedMotion:

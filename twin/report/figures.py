@@ -37,6 +37,7 @@ from twin.drawing.prc_drawing import (
     shade_precompression,
 )
 from twin.drawing.run_figures import (
+    draw_best_linear,
     draw_histories,
     draw_legend,
     draw_loop_figures,
@@ -64,6 +65,7 @@ def draw_figures(run: ReportData) -> CaptionedFigures:
     """Yield all figures for which the run has data, in report order."""
     for draw in (
         draw_swept_sine,
+        draw_best_linear,
         draw_orbits,
         _draw_prc,
         _draw_model_branches,

@@ -387,6 +387,31 @@ class TrackingResult(TrackingError):
     )
 
 
+class BestLinearResult(Contract):
+    """Best linear approximation of one pair of accelerations, by line of a periodic multisine.
+
+    See `twin.results.best_linear`. Ratios are rms over that of the output on the excited lines.
+    """
+
+    input: str = Field(description="command, or a channel")
+    output: str = Field(description="channel")
+    band_hz: tuple[Hertz, Hertz] | None = Field(
+        description="in which at most half of the power of a period is noise: nothing can be "
+        "promised of the output beyond it; null: nowhere"
+    )
+    distortion_ratio: RealRatio = Field(description="nonlinear distortion on the excited lines")
+    noise_ratio: RealRatio = Field(description="noise on the excited lines, of one period")
+    even_ratio: Ratio = Field(description="distortion on even lines; null: they are excited")
+    odd_ratio: Ratio = Field(description="distortion on odd lines that were left out; null: none")
+    frequency_hz: list[RealHertz] = Field(description="excited lines")
+    gain: list[RealRatio] = Field(description="of the approximation")
+    phase_deg: list[RealDegrees] = Field(description="of the approximation")
+    half_width: list[RealRatio] = Field(description="radius of the circle of 95 % about it")
+    level_m_s2: list[RealAcceleration] = Field(description="amplitude of the output")
+    distortion_m_s2: list[RealAcceleration] = Field(description="nonlinear distortion in it")
+    noise_m_s2: list[RealAcceleration] = Field(description="noise in it, of one period")
+
+
 class SweptPoint(Contract):
     """Level of a swept sine over a few cycles; all levels are fundamentals."""
 
@@ -594,6 +619,9 @@ class RunSummary(Contract):
     )
     tracking: TrackingResult | None = Field(
         None, description="of the table, in a displacement history that was measured"
+    )
+    best_linear: list[BestLinearResult] = Field(
+        [], description="of table and specimen; absent without a periodic multisine"
     )
     swept_sine: SweptSineResult | None = Field(
         None, description="level of a swept sine; absent otherwise"

@@ -37,6 +37,7 @@ from twin.compare.pipeline import EVENT_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
 from twin.recording.reader import Recording
+from twin.results.best_linear import estimate_best_linear, format_best_linear
 from twin.results.contracts import (
     ChannelError,
     CheckEntry,
@@ -167,6 +168,8 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
         )
         summary.windows = summarise_windows(recording, profile.comparison.contact_n, compare)
         summary.tracking = summarise_tracking(recording, profile)
+        if approximations := estimate_best_linear(recording, profile):
+            summary.best_linear = approximations
     _add_kind_results(summary, recording, profile)
     summary.excitation_verdict = judge_excitation(summary, profile)
     summary.twin_verdict = judge_twin(summary)
@@ -448,6 +451,7 @@ def format_summary(summary: RunSummary, planned: int) -> str:
     parts = [f"{summary.verdict}: {_format_extent(summary, planned)}"]
     if summary.tracking:
         parts.append(format_tracking(summary.tracking))
+    parts += [format_best_linear(result) for result in summary.best_linear]
     if summary.visits:
         parts.append(f"{len(summary.visits)} steps added during the test")
     parts += summary.findings

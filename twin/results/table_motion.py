@@ -69,7 +69,7 @@ def find_table_motion(recording: Recording, profile: Profile) -> TableMotion | N
     acceleration = np.pad(history_acceleration(history, rate_hz)[: end - start], (before, after))
     first = start - before
     achieved_disp, achieved_acc = (
-        _extract_channel(blocks, name, first, end + after)
+        extract_channel(blocks, name, first, end + after)
         for name in ("table_disp_m", "table_acc_m_s2")
     )
     if not acceleration.any() or not np.isfinite(achieved_acc).any():
@@ -93,7 +93,7 @@ def _count_rest(blocks: tuple[Block, ...], samples: range) -> int:
     return len(samples)
 
 
-def _extract_channel(blocks: tuple[Block, ...], name: str, first: int, end: int) -> Float1D:
+def extract_channel(blocks: tuple[Block, ...], name: str, first: int, end: int) -> Float1D:
     """Return a channel at the samples first .. end - 1, NaN where there is none."""
     values = np.full(end - first, np.nan)
     for block in blocks:

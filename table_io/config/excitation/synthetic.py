@@ -1,11 +1,12 @@
-"""Synthetic histories: band-limited noise, chirp, cyclic protocol, half-sine shock, sine pulse."""
+"""Synthetic histories: noise, multisine, chirp, cyclic protocol, half-sine shock, sine pulse."""
 
 from typing import ClassVar, Literal
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, ValidationInfo, field_validator
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Int1D
 from table_io.config.base import Count, NonNegative, Number, Positive
 from table_io.config.excitation import MIN_BLEND_CYCLES, History, register_excitation
 from table_io.config.excitation.waveform import (
@@ -21,6 +22,7 @@ from table_io.units import GRAVITY_M_S2
 
 MAX_BAND_SHARE = 0.4  # of the sampling rate
 MIN_LINES = 8  # spectral lines in the band
+DETECTION_GROUP = 4  # odd lines, of which a multisine leaves one out
 
 
 @register_excitation("random")
@@ -82,6 +84,10 @@ class BandLimitedRandom(History):
 
     def displacement(self, rate_hz: float) -> Float1D:
         """Return the noise in m, between ramps that continue it periodically, (sample,)."""
+        self._check_rate(rate_hz)
+        return self._play(self._make_period(rate_hz, self.seed), rate_hz)
+
+    def _check_rate(self, rate_hz: float) -> None:
         if self.high_hz > MAX_BAND_SHARE * rate_hz:
             raise InputError(
                 f"too high for {rate_hz:g} samples per second",
@@ -90,21 +96,77 @@ class BandLimitedRandom(History):
                 value=self.high_hz,
                 allowed=f"up to {MAX_BAND_SHARE * rate_hz:g}",
             )
-        count, ramp = round(self.duration_s * rate_hz), round(self.ramp_s * rate_hz)
-        f = np.fft.rfftfreq(count, 1.0 / rate_hz)
-        lines = np.flatnonzero((f >= self.low_hz) & (f <= self.high_hz))
+
+    def list_lines(self, rate_hz: float) -> Int1D:
+        """Return the numbers of the spectral lines that are excited, (line,), rising."""
+        f = np.fft.rfftfreq(round(self.duration_s * rate_hz), 1.0 / rate_hz)
+        return np.flatnonzero((f >= self.low_hz) & (f <= self.high_hz))
+
+    def _make_period(self, rate_hz: float, seed: int) -> Float1D:
+        """Return a period with the phases of a seed in m, (sample,)."""
+        count = round(self.duration_s * rate_hz)
+        f, lines = np.fft.rfftfreq(count, 1.0 / rate_hz), self.list_lines(rate_hz)
         corner_hz = self.corner_hz or self.low_hz
         amplitude = np.minimum(f[lines] / corner_hz, 1.0)
         rms = self.rms_g * GRAVITY_M_S2
         amplitude *= rms / np.sqrt(0.5 * (amplitude @ amplitude))
-        raw = np.random.PCG64(self.seed).random_raw(lines.size)
-        phase = 2.0 * np.pi * (np.asarray(raw, dtype=np.uint64) >> np.uint64(11)) * 2.0**-53
+        phase = 2.0 * np.pi * _draw_shares(seed, lines.size)
         spectrum = np.zeros(f.size, dtype=np.complex128)
         spectrum[lines] = -amplitude / (2.0 * np.pi * f[lines]) ** 2 * np.exp(1j * phase)
-        period = np.fft.irfft(spectrum, count) * (count / 2.0)
-        played = np.take(period, np.arange(-ramp, count + ramp + 1), mode="wrap")
+        return np.asarray(np.fft.irfft(spectrum, count) * (count / 2.0))
+
+    def _play(self, period: Float1D, rate_hz: float, periods: int = 1) -> Float1D:
+        """Return periods between ramps that continue them, in m, (sample,)."""
+        ramp = round(self.ramp_s * rate_hz)
+        played = np.take(period, np.arange(-ramp, periods * period.size + ramp + 1), mode="wrap")
         x = np.arange(played.size)
         return played * smoothstep(x / ramp) * smoothstep((played.size - 1 - x) / ramp)
+
+
+def _draw_shares(seed: int, count: int) -> Float1D:
+    """Return numbers from 0 to 1, (count,), that do not change between versions of numpy."""
+    raw = np.random.PCG64(seed).random_raw(count)
+    return np.asarray((np.asarray(raw, dtype=np.uint64) >> np.uint64(11)) * 2.0**-53)
+
+
+@register_excitation("multisine")
+class PeriodicMultisine(BandLimitedRandom):
+    """Random-phase multisine played in periods, several times with new phases.
+
+    The periods of a realisation differ by noise alone, the realisations by the distortion of a
+    nonlinear table or specimen too. With `odd` only odd lines are excited, and one of each
+    DETECTION_GROUP of them is left out at random: what comes there is odd distortion, on the even
+    lines even distortion. Source: Pintelon and Schoukens (2012), sections 4.3.1 and 5.2.
+    """
+
+    duration_s: Number = Field(16.0, gt=0, le=600, description="Of a period.")
+    periods: Count = Field(3, ge=2, le=100, description="Measured, after one that settles.")
+    realisations: Count = Field(4, ge=2, le=100, description="With phases of their own.")
+    odd: bool = Field(True, description="Leave out the even lines, and every fourth odd one.")
+
+    def list_lines(self, rate_hz: float) -> Int1D:
+        """Return the numbers of the spectral lines that are excited, (line,), rising."""
+        lines = super().list_lines(rate_hz)
+        if not self.odd:
+            return lines
+        lines = lines[lines % 2 == 1]
+        groups = lines.size // DETECTION_GROUP
+        left_out = (DETECTION_GROUP * _draw_shares(self.seed, groups)).astype(int)
+        return np.delete(lines, DETECTION_GROUP * np.arange(groups) + left_out)
+
+    def list_starts(self, rate_hz: float) -> npt.NDArray[np.int64]:
+        """Return the first samples of the measured periods, (realisation, period)."""
+        count, ramp = round(self.duration_s * rate_hz), round(self.ramp_s * rate_hz)
+        whole = (self.periods + 1) * count + 2 * ramp + 1
+        first = whole * np.arange(self.realisations) + ramp + count
+        return np.asarray(first[:, None] + count * np.arange(self.periods))
+
+    def displacement(self, rate_hz: float) -> Float1D:
+        """Return all realisations in m, each from rest to rest, (sample,)."""
+        self._check_rate(rate_hz)
+        seeds = range(self.seed, self.seed + self.realisations)
+        periods = [self._make_period(rate_hz, seed) for seed in seeds]
+        return np.concatenate([self._play(own, rate_hz, self.periods + 1) for own in periods])
 
 
 MIN_RAMP_S = 0.5

@@ -45,6 +45,7 @@ EXAMPLES: dict[str, dict[str, Any]] = {
     "half_sine": {"duration_s": 0.2, "acceleration_g": 0.2, "pulses": 2, "windows": 2},
     "chirp": {"start_hz": 1.0, "stop_hz": 8.0, "duration_s": 12.0, "acceleration_g": 0.1},
     "random": {"low_hz": 0.5, "high_hz": 12.0, "rms_g": 0.03, "duration_s": 10.0},
+    "multisine": {"low_hz": 0.5, "high_hz": 12.0, "duration_s": 4.0, "periods": 2},
     "swept_sine": {"start_hz": 1.5, "stop_hz": 3.0, "octaves_per_min": 6.0, "displacement_mm": 4.0},
     "cyclic": {"protocol": [[5.0, 0.5, 2], [10.0, 1.0, 3]], "windows": 4},
     "pulse_train": {"height_mm": 5.0, "width_s": 0.8, "period_s": 1.5, "windows": 3},
