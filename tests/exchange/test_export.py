@@ -2,6 +2,7 @@
 
 import sys
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,12 @@ def test_rerun_reads_its_file(log: Path, out: Path, tmp_path: Path) -> None:
     rows = rows_by_entity(out.with_suffix(".rrd"))
     assert sum(count >= measured(read_recording(log))[0].size for count in rows.values()) >= 3
     start = read_recording(log).start
+    changing = [c for c in RrdReader(out.with_suffix(".rrd")).stream() if not c.is_static]
+    for batch in (chunk.to_record_batch() for chunk in changing):
+        time, date = (np.array(batch.column(name).cast("int64")) for name in ("time", "date"))
+        assert set(date - time) == {
+            round(1e9 * datetime.fromisoformat(start.started_at).timestamp())
+        }
     write_items(tmp_path / "run.mcap", [*read_recording(log).items], start)
     assert iter_batches(tmp_path / "run.mcap", 9) is not None
     assert iter_batches(log, 9) is None
@@ -130,7 +137,10 @@ def test_a_choice_of_channels_and_steps(log: Path, tmp_path: Path) -> None:
         ExportOptions(log, ("csv",), tmp_path / "a.csv", channels=("mass_disp_m",), steps=(2, 3))
     )
     table = read_table(tmp_path / "a.csv")
-    assert set(table.columns) == {"time_s", "mass_disp_m", *LABEL_UNITS}
+    assert set(table.columns) == {"time_s", "mass_disp_m", *LABEL_UNITS, "unix_time_s"}
+    started_s = datetime.fromisoformat(read_recording(log).start.started_at).timestamp()
+    absolute = table.read_column("unix_time_s") - table.read_column("time_s")
+    assert np.abs(absolute - started_s).max() < 1e-6
     assert set(table.read_column("step")) == {2, 3}
     samples = read_samples(table, None)
     back = read_labels(table, samples)

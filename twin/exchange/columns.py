@@ -39,7 +39,7 @@ from twin.exchange.integration import (
     integrate_accelerations,
 )
 from twin.exchange.plausibility import list_implausible
-from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, UNIX_TIME_COLUMN
 
 MAX_SAMPLES_PER_ROW = 10  # beyond, the rows are not one recording
 
@@ -287,7 +287,7 @@ def _select_columns(
     used = {column.column for column in mapped.values()}
     left_out, twins = [], 0
     for name in table.columns:
-        if name in used or name in mapped:
+        if name in used or name in mapped or name == UNIX_TIME_COLUMN:
             continue
         if name.startswith(TWIN_PREFIX):
             twins += 1

@@ -6,6 +6,7 @@ from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from table_io.channels import TIME_COLUMN
 from table_io.errors import InputError, require_package
 from table_io.formats.text import write_csv
 from table_io.records import RunStart
@@ -13,8 +14,16 @@ from twin.exchange.crate import CRATE_FILE, write_crate
 from twin.exchange.fmu import write_fmu
 from twin.exchange.foxglove import build_layout, write_foxglove
 from twin.exchange.uff58 import write_uff58
+from twin.recording.reader import find_start_ns
 from twin.recording.run_paths import resolve_log_path
-from twin.recording.tabular import TWIN_PREFIX, LogTable, iter_batches, read_log_table
+from twin.recording.tabular import (
+    TWIN_PREFIX,
+    UNIX_TIME_COLUMN,
+    Columns,
+    LogTable,
+    iter_batches,
+    read_log_table,
+)
 from twin.results.recordings import open_recording
 from twin.results.rerun import restore_log
 
@@ -133,7 +142,7 @@ def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
     """Write the rows to a new file; imports the library of the format."""
     if kind == "csv":
         with path.open("x", encoding="utf-8", newline="") as text:
-            write_csv(rows.units, rows.iter_windows(), text)
+            write_csv(*_add_absolute_time(rows), text)
         return
     if kind == "hdf5":
         from twin.exchange.nexus import write_hdf5  # imports h5py
@@ -159,6 +168,18 @@ def _write_rows(kind: str, rows: LogTable, path: Path) -> None:
             write_mat(rows.units, columns, {**facts, "rate_hz": start.rate_hz}, file)
         else:
             write_foxglove(rows, file)
+
+
+def _add_absolute_time(rows: LogTable) -> tuple[list[str], Iterable[Columns]]:
+    """Return names and windows of the columns, with the time since 1970 where a start is stated."""
+    started_ns = find_start_ns(rows.start)
+    if not started_ns:
+        return [*rows.units], rows.iter_windows()
+    windows = (
+        window | {UNIX_TIME_COLUMN: 1e-9 * started_ns + window[TIME_COLUMN]}
+        for window in rows.iter_windows()
+    )
+    return [*rows.units, UNIX_TIME_COLUMN], windows
 
 
 def _write_rrd(path: Path, output_path: Path) -> None:

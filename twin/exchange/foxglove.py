@@ -19,6 +19,7 @@ from table_io.block import Int1D
 from table_io.channels import TIME_COLUMN
 from table_io.records import Event, NormalizedResponse, PrcPoint, Record, format_record
 from twin.recording.mcap_log import open_foreign_log
+from twin.recording.reader import find_start_ns
 from twin.recording.tabular import (
     DIRECTION_SIGNS,
     LABEL_UNITS,
@@ -78,7 +79,7 @@ def write_foxglove(rows: LogTable, file: BinaryIO) -> None:
         topic: topic_fields for topic, topic_fields in fields_by_topic.items() if topic_fields
     }
     curves = [(name, "double") for name in PRC_COLUMNS]
-    clock = SampleClock(rows.started_ns, rows.start.rate_hz)
+    clock = SampleClock(find_start_ns(rows.start), rows.start.rate_hz)
     with open_foreign_log(file) as writer:
         ids = {}
         for topic, message_fields in {

@@ -32,7 +32,7 @@ from table_io.formats.words import (
 from table_io.units import UNITS
 from twin.exchange.columns import CANONICAL_COLUMNS, ColumnMap, ColumnSource, ImportColumns
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
-from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, UNIX_TIME_COLUMN
 
 BODY_WORDS = {
     "command": {"cmd", "command", "commanded", "reference", "ref", "drive", "setpoint", "target"},
@@ -145,7 +145,7 @@ def propose_map(
     names = [
         name
         for name in _select_recording(table)
-        if name not in LABEL_UNITS and not name.startswith(TWIN_PREFIX)
+        if name not in (*LABEL_UNITS, UNIX_TIME_COLUMN) and not name.startswith(TWIN_PREFIX)
     ]
     quantities = {name: find_quantity(name, table.columns[name].unit) for name in names}
     questions: list[str] = []
@@ -210,7 +210,7 @@ def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:
         return
     usual = table.columns[names[0]]
     for name, column in table.columns.items():
-        is_known = name in names or name in LABEL_UNITS or name.startswith(TWIN_PREFIX)
+        is_known = name in (*names, *LABEL_UNITS, UNIX_TIME_COLUMN) or name.startswith(TWIN_PREFIX)
         if is_known or find_quantity(name, column.unit) not in CHANNELS_OF:
             continue
         if column.rate_hz and usual.rate_hz and column.rate_hz != usual.rate_hz:

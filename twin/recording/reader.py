@@ -5,6 +5,7 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -214,6 +215,14 @@ def _matches_topic(topic: str, payload: bytes, run: str) -> bool:
     except WireError:
         return False
     return item_run == run != "" and encode_item(item, run) == payload
+
+
+def find_start_ns(start: RunStart) -> int:
+    """Return the start of a run in ns since 1970, 0 without one; local time without a zone."""
+    try:
+        return max(0, round(datetime.fromisoformat(start.started_at).timestamp() * 1e9))
+    except (ValueError, OverflowError):
+        return 0
 
 
 def read_start(path: Path) -> RunStart:

@@ -9,7 +9,6 @@ twin columns are NaN where the twin has no output. Invalid items are left out by
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
 from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
@@ -40,6 +39,7 @@ LABEL_UNITS = {
 }  # fmt: skip
 DIRECTION_SIGNS = {"forward": 1, "backward": -1}
 TWIN_PREFIX = "twin_"
+UNIX_TIME_COLUMN = "unix_time_s"  # last of CSV, which holds no other facts of the run
 SCRATCH_COLUMNS = ("index", "step", "label", "cycle")  # before the channels of a sample
 KEPT_RECORDS = (RunStop, Event, PrcPoint, StepAdded)
 MAX_LATENESS_S = 1.0  # of a message after later ones, in a log that can be read in order
@@ -107,15 +107,6 @@ class LogTable:
         """TOML texts of profile, rig and model, with which the run can be repeated."""
         names = ("profile_toml", "rig_toml", "model_toml")
         return {name: getattr(self.start, name) for name in names}
-
-    @property
-    def started_ns(self) -> int:
-        """Start of the run in ns since 1970, 0 if it is not stated; local time without a zone."""
-        try:
-            start = datetime.fromisoformat(self.start.started_at)
-            return max(0, round(start.timestamp() * 1e9))
-        except (ValueError, OverflowError):
-            return 0
 
     def iter_windows(self) -> Iterator[Columns]:
         """Yield all columns in consecutive windows of WINDOW_ROWS rows."""

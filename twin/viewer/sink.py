@@ -1,7 +1,8 @@
 """Rerun output: a new .rrd file, a server on the loopback interface, or both.
 
-Data are sent in columns, few entities with many instances, on one timeline `time` computed from
-the sample index. Viewers connect to the server, so that a hanging viewer cannot block the run.
+Data are sent in columns, few entities with many instances, on the timeline `time` computed from the
+sample index, and on `date`, the absolute time, if the start is stated. Viewers connect to the
+server, so that a hanging viewer cannot block the run.
 """
 
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import rerun as rr
 from table_io.block import Float2D, Int1D
 from table_io.errors import InputError
 from table_io.records import RunStart
+from twin.recording.reader import find_start_ns
 from twin.viewer.address import parse_address
 from twin.viewer.plots import DARK_GREY, GREY, LineStyle, PlotAxes, Rgb
 from twin.viewer.scene import BoxFrames, Float3D
@@ -37,6 +39,7 @@ class RerunSink:
         if address:
             sinks.append(rr.GrpcServerSink(*address, server_memory_limit=SERVER_MEMORY_LIMIT))
         self._ns_per_sample = 1e9 / start.rate_hz
+        self._started_ns = find_start_ns(start)
         self._recording = rr.RecordingStream("shaketwin")
         self._recording.set_sinks(*sinks, default_blueprint=blueprint)
         self._recording.send_recording_name(f"{start.name} {start.run}")
@@ -64,9 +67,12 @@ class RerunSink:
         if not len(index):
             return
         ns = np.rint(np.asarray(index, dtype=np.float64) * self._ns_per_sample)
-        times = rr.TimeColumn("time", duration=ns.astype("timedelta64[ns]"))
+        times = [rr.TimeColumn("time", duration=ns.astype("timedelta64[ns]"))]
+        if self._started_ns:
+            dates = (self._started_ns + ns.astype(np.int64)).astype("datetime64[ns]")
+            times.append(rr.TimeColumn("date", timestamp=dates))
         flat = [column for group in columns for column in group]
-        rr.send_columns(entity, [times], flat, recording=self._recording)
+        rr.send_columns(entity, times, flat, recording=self._recording)
 
     def send_scalars(
         self, entity: str, index: Sequence[int] | Int1D, values: npt.ArrayLike
