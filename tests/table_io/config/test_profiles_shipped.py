@@ -75,7 +75,7 @@ def test_files_that_users_script_against_are_there(name: str) -> None:
 
 def test_list_of_shipped_tests_is_complete() -> None:
     assert {path.stem for path in SHIPPED} == {
-        *PAPER, "demo", "quickstart", "record_example", "el_centro", "rehearsal",
+        *PAPER, "demo", "quickstart", "record_example", "el_centro", "rehearsal", "multisine",
         "swept_sine",
         *TOOLS, *PLANNED_BY_TWIN,
     }  # fmt: skip
