@@ -18,7 +18,7 @@ from table_io.block import Float1D
 from table_io.config.base import format_toml, read_text
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.folders import resolve_config
-from table_io.config.profile import Profile, load_profile
+from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
 from table_io.config.tracking import RequiredSpectrum, parse_required_spectrum
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
@@ -37,6 +37,7 @@ SAMPLES_PER_PERIOD = 10.0  # of the record at the upper end of the spectrum
 MIN_RATE_HZ = 100.0
 BAND_MARGIN = 2.0**0.5  # of the record beyond either end of the spectrum: half an octave
 FILTER_MARGIN = 2.5  # of the filter of the test beyond either end of the spectrum
+ROW_BYTES = 23  # of the file of a record, at most: 999.999900,-0.12345678
 SIGNIFICANT_SHARES = 0.05, 0.95  # of the Arias intensity: significant duration
 
 
@@ -110,9 +111,14 @@ def make_spectrum_records(
     return records
 
 
+def _find_record_rate(high_hz: float) -> float:
+    """Return the rate in Hz of a record up to a frequency."""
+    return max(MIN_RATE_HZ, 10.0 * math.ceil(0.1 * SAMPLES_PER_PERIOD * high_hz))
+
+
 def _match_record(spectrum: RequiredSpectrum, shape: RecordShape, seed: int) -> SpectrumRecord:
     low_hz, high_hz = spectrum.frequencies_hz[[0, -1]].tolist()
-    rate_hz = max(MIN_RATE_HZ, 10.0 * math.ceil(0.1 * SAMPLES_PER_PERIOD * high_hz))
+    rate_hz = _find_record_rate(high_hz)
     count = round(shape.duration_s * rate_hz)
     f = np.fft.rfftfreq(count, 1.0 / rate_hz)
     band = (f >= low_hz / BAND_MARGIN) & (f <= high_hz * BAND_MARGIN)
@@ -197,6 +203,7 @@ def compute_spectrum_records(
     spectrum = parse_required_spectrum(text, options.spectrum.name)
     like_path = resolve_config(options.like, "tests")
     like, _ = load_profile(like_path)
+    _check_test_plays(spectrum, options, like)
     records = make_spectrum_records(spectrum, options.shape, report)
     files, profiles = {options.spectrum.name: text}, []
     for number, record in enumerate(records, 1):
@@ -207,6 +214,29 @@ def compute_spectrum_records(
     return SpectrumRecordResult(
         tuple(records), find_largest_correlation(records), files, tuple(profiles)
     )
+
+
+def _check_test_plays(
+    spectrum: RequiredSpectrum, options: SpectrumRecordOptions, like: Profile
+) -> None:
+    """Raise InputError if a test like `like` cannot judge the spectrum or read the record."""
+    high_hz, rate_hz = float(spectrum.frequencies_hz[-1]), like.acquisition.rate_hz
+    if high_hz > MAX_BAND_RATIO * rate_hz * (1 + 1e-9):
+        raise InputError(
+            f"the spectrum ends at {high_hz:g} Hz",
+            where=options.spectrum,
+            allowed=f"up to {MAX_BAND_RATIO * rate_hz:g} Hz, where the test samples at {rate_hz:g} "
+            "Hz",
+            remedy=f"set acquisition.rate_hz of {options.like} to "
+            f"{high_hz / MAX_BAND_RATIO:g} or more, or end the spectrum earlier",
+        )
+    longest_s = MAX_FILE_BYTES / ROW_BYTES / _find_record_rate(high_hz)
+    if options.shape.duration_s > longest_s:
+        raise InputError(
+            f"a record of {options.shape.duration_s:g} s up to {high_hz:g} Hz is too large a file",
+            where=options.spectrum,
+            allowed=f"at most {math.floor(longest_s)} s",
+        )
 
 
 def _format_record(record: SpectrumRecord, options: SpectrumRecordOptions, number: int) -> str:
@@ -227,7 +257,6 @@ def _format_profile(
     record: SpectrumRecord, options: SpectrumRecordOptions, like: Profile, stem: str
 ) -> str:
     low_hz, high_hz = record.frequencies_hz[[0, -1]].tolist()
-    rate_hz = like.acquisition.rate_hz
     kept = like.model_dump(exclude_unset=True, include={"loop_check", "protection", "limits"})
     table = {
         "title": f"{options.spectrum.stem}, {stem.replace('_', ' ')}",
@@ -241,12 +270,12 @@ def _format_profile(
             "scale": 1.0,
             "baseline": "none",
             # Wider than the record, so that the filter only brings it to rest at its ends.
-            "band_hz": [low_hz / FILTER_MARGIN, min(FILTER_MARGIN * high_hz, 0.4 * record.rate_hz)],
+            "band_hz": [low_hz / FILTER_MARGIN, FILTER_MARGIN * high_hz],
         },
         "tracking": {
             "required_spectrum": options.spectrum.name,
             "damping": options.shape.damping,
-            "band_hz": [low_hz, min(high_hz, MAX_BAND_RATIO * rate_hz)],
+            "band_hz": [low_hz, high_hz],
         },
         **kept,
     }
