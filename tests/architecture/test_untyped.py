@@ -53,7 +53,10 @@ def list_aliases(tree: ast.Module) -> Iterator[str]:
 def count_untyped(tree: ast.Module) -> int:
     """Untyped dictionaries in the signatures of the public functions and methods of a module."""
     untyped = {*UNTYPED, *list_aliases(tree)}
-    scopes = [tree, *(node for node in tree.body if isinstance(node, ast.ClassDef))]
+    scopes: list[ast.Module | ast.ClassDef] = [
+        tree,
+        *(node for node in tree.body if isinstance(node, ast.ClassDef)),
+    ]
     return sum(
         (node.id if isinstance(node, ast.Name) else ast.unparse(node)) in untyped
         for scope in scopes

@@ -2,9 +2,10 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
 
 
-def seal_truth(folder: Path, text: str) -> dict[str, str]:
+def seal_truth(folder: Path, text: str) -> dict[str, Any]:
     """Write a truth and return the keys of [simulated] that name it."""
     path = folder / "truth.toml"
     path.write_text(text, encoding="utf-8")

@@ -3,6 +3,7 @@
 import json
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -67,7 +68,9 @@ def test_the_seal_is_compared_with_what_discovery_named(tmp_path: Path) -> None:
     right = EffectResult(id=hidden.id, confidence=0.9, parameters=fit)
     false = EffectResult(id="other", confidence=0.9, parameters={})
     lines = {
-        key: compare_with_seal(hidden, Verdict.model_construct(verdict=word, effects=effects))
+        key: compare_with_seal(
+            hidden, Verdict.model_construct(**dict[str, Any](verdict=word, effects=effects))
+        )
         for key, word, effects in (
             ("right", "named", [right]),
             ("more", "named", [right, false]),

@@ -116,7 +116,7 @@ def test_unit_is_the_own_solver_over_a_sweep_with_contacts(
     config = parse_toml(MODELS[name], ModelConfig, "model")
     solver = prepare_solver(config.build_model(profile.specimen), RATE_HZ)
     own = np.empty((OUTPUT_COUNT, inputs.shape[1]))
-    solver.advance(solver.rest_state(), *inputs, own)
+    solver.advance(solver.rest_state(), inputs[0], inputs[1], own)
     assert (own[3] > 0).any(), "no contact on the right"
     assert (own[4] < 0).any(), "no contact on the left"
     outputs = run_unit(tmp_path / "unit.fmu", tmp_path / "unpacked", inputs)

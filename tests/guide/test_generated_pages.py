@@ -147,6 +147,6 @@ def test_the_result_on_the_paper_is_that_of_its_features_file() -> None:
     ]
     assert explained[:2] == [content.given.explained, content.refitted.explained]
     assert explained[2] == max(fit.explained for fit in content.fits)
-    page = write_paper_gap(typer.Typer())
+    page = write_paper_gap(PROGRAM)
     assert page.count(" ✗ |") == 3 * len(published) - sum(explained)
     assert content.next_run[1:] in page

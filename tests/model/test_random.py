@@ -7,6 +7,7 @@ import pytest
 
 from tests.model.motion import U_L, U_R, U, kick, run
 from tests.model.reference import linear_between, reference
+from twin.dynamics.closed_form_map import ClosedFormMap
 from twin.dynamics.event_driven_map import make_period_map
 from twin.model.model import Model
 from twin.model.parameters import Parameters
@@ -69,6 +70,7 @@ def stepped_errors(seed: int) -> tuple[float, float, int]:
         dt=1 / (FEWEST_STEPS * fast),
     )  # fmt: skip
     period_map = make_period_map(Model(p), hz, peak)
+    assert isinstance(period_map, ClosedFormMap)
     impacts, x = period_map.find_contacts(start.take(period_map.indices), 3)
     state = period_map.to_state(x)
     assert impacts[:, 1:].tolist() == contacts[:, 1:].tolist()

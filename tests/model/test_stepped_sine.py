@@ -9,6 +9,7 @@ from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from tests.model.motion import restart
 from tests.model.reference import AG, reference, snm
+from twin.dynamics.closed_form_map import ClosedFormMap
 from twin.dynamics.event_driven_map import make_period_map
 from twin.model import closed_form
 from twin.model.ideal_response import simulate_sweep
@@ -50,6 +51,7 @@ def test_agrees_with_dop853_over_ten_cycles(frequency):
     sweep = simulate_stepped_sine(p, [frequency], AG, 10, state=start)
     assert np.abs(sweep.states[0, :4] - want[:, -1])[[0, 2, 3]].max() < 1e-13
     period_map = make_period_map(Model(p), frequency, AG)
+    assert isinstance(period_map, ClosedFormMap)
     impacts, end = period_map.find_contacts(start[:4], 10)
     state = period_map.to_state(end)
     assert impacts[:, 1:].tolist() == contacts[:, 1:].tolist()

@@ -36,7 +36,7 @@ def list_faults() -> Iterator[tuple[str, str, str, Callable[[Samples], None]]]:
     for test in TESTS:
         yield "mass laser on the table", test, test, on_table
 
-    def change(name: str, function: Callable[[Float1D], Float1D]) -> Callable[[Samples], None]:
+    def change(name: str, function: Callable[..., Float1D]) -> Callable[[Samples], None]:
         def apply(s: Samples) -> None:
             s[name] = function(s[name])
 

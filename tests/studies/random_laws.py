@@ -144,11 +144,11 @@ def judge_law(recording: Recording, config: RunConfig, model: Path, folder: Path
     if failures or not is_finite:
         restarted = any("restarted" in event.text for event in failures)
         free = not is_finite or any("restarted" not in event.text for event in failures)
-        error = summary.comparison["rel_disp_m"]
+        errors = summary.comparison["rel_disp_m"]
         if verdict.verdict == "agrees" or not failures:
             return f"WRONG: {verdict.verdict}, {verdict.reason}, {len(failures)} failures"
-        if (free and error.free_nrmse is not None) or (restarted and error.nrmse is not None):
-            return f"WRONG: scores {error.free_nrmse}, {error.nrmse} of a failed twin"
+        if (free and errors.free_nrmse is not None) or (restarted and errors.nrmse is not None):
+            return f"WRONG: scores {errors.free_nrmse}, {errors.nrmse} of a failed twin"
         return f"{end}, failed in a replay" if end != "finite" else "failed, by name"
     return end if end != "finite" else f"finite, twin {verdict.verdict}"
 

@@ -58,5 +58,7 @@ def make_stored_study(path: Path, out: Path, chunks: range) -> Study:
     create_store(out, study, make_sweep_plan(study), sample_parameters(study.config))
     manifest = Manifest(out, [variable.name for variable in study.variables])
     for chunk in chunks:
-        manifest.add(compute_chunk(out, chunk))
+        stored = compute_chunk(out, chunk)
+        assert not isinstance(stored, str), stored
+        manifest.add(stored)
     return study

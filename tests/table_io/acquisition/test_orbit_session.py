@@ -104,6 +104,7 @@ def test_measured_orbits_are_those_of_the_plant(held: PlayedSession) -> None:
 def test_measured_multipliers_are_those_of_the_plant(held: PlayedSession) -> None:
     for point in held.select(OrbitPoint):
         true = np.interp(point.frequency_hz, *TRUE_ORBITS[:, ::2].T)
+        assert point.multiplier_sd is not None
         assert point.multiplier_sd < 0.15 * true
         assert abs(point.multiplier - true) < 3.0 * point.multiplier_sd
 

@@ -38,7 +38,8 @@ def profile(block_samples: int = 20, **sweep: Any) -> Profile:
     No loop check and nothing tuned: the whole drive is known before it is played.
     """
     off = {"enabled": False}
-    tables = {"acquisition": {"block_samples": block_samples}, "loop_check": off, "control": off}
+    acquisition: dict[str, Any] = {"block_samples": block_samples}
+    tables = {"acquisition": acquisition, "loop_check": off, "control": off}
     return make_profile(tables=tables, **{"cycles": 3, "measured_cycles": 1, **sweep})
 
 

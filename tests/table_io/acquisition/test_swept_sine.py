@@ -63,7 +63,7 @@ def measure_cycles(played: PlayedSession, channel: str) -> tuple[Float1D, Float1
                 0.5 * (first + end) / rate_hz,
             )
         )
-    return tuple(np.array(rows).T)  # type: ignore[return-value]
+    return tuple(np.array(rows).T)
 
 
 def assert_smooth_rest(played: PlayedSession, planned_m_s2: float = 0.0) -> None:

@@ -46,7 +46,12 @@ def start_backend(bed: Bed) -> NiBackend:
 
 
 def session(bed: Bed) -> list[Any]:
-    grid = {"start_hz": 2.0, "stop_hz": 2.4, "step_hz": 0.4, "directions": ["forward"]}
+    grid: dict[str, Any] = {
+        "start_hz": 2.0,
+        "stop_hz": 2.4,
+        "step_hz": 0.4,
+        "directions": ["forward"],
+    }
     profile = make_profile(tables={"loop_check": {"enabled": False}}, **grid)
     setup = SessionSetup(profile, bed.rig)
     return list(run_session(setup, bed.backend(), bed.clock, make_start, lambda: None))

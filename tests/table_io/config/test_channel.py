@@ -3,14 +3,14 @@
 import pytest
 
 from table_io.backends.opendaq.config import OpenDaqWiring
-from table_io.channels import CHANNEL_BY_NAME, Channel
+from table_io.channels import CHANNEL_BY_NAME, TIME_COLUMN, Channel
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.channel import CONSTANT, QUANTITIES, read_channels
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError
 from table_io.units import UNITS
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, make_lab_rig
-from twin.recording.tabular import LABEL_UNITS, TIME_COLUMN, TWIN_PREFIX
+from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX
 
 
 def list_faults(text: str) -> tuple[InputError, ...]:

@@ -65,7 +65,7 @@ def make_file(base: str, change: Any) -> tuple[type[ConfigModel], str]:
     if base == "accelerometer":
         change = (ACCELEROMETER, ACCELEROMETER + "\n".join(change) + "\n")
     assert change[0] in text
-    return model, text.replace(*change, 1)
+    return model, text.replace(change[0], change[1], 1)
 
 
 # fmt: off

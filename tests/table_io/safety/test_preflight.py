@@ -292,7 +292,8 @@ def test_demand_at_its_limit_is_allowed_and_beyond_it_refused(
     area = {"piston_area_cm2": 20.0} if name == "flow" else {}
 
     def limit_rig(allowed: float) -> RigConfig:
-        return change_rig(**{table: {field: allowed, **area}})
+        tables: dict[str, Any] = {table: {field: allowed, **area}}
+        return change_rig(**tables)
 
     (limit,) = (item for item in list_limits(limit_rig(1.0)) if item.name == name)
     allowed = limit.demand(row)

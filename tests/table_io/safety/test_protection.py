@@ -242,7 +242,7 @@ def make_response(lag_s: float) -> FrequencyResponse:
     return FrequencyResponse(0, frequencies_hz, (1.0, 1.0, 1.0), phases)
 
 
-WARN = {"test": make_test("warn")}
+WARN: dict[str, Any] = {"test": make_test("warn")}
 
 
 @dataclass(frozen=True)
