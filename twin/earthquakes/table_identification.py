@@ -59,6 +59,7 @@ FRAME_NAMES = "frame_hz", "frame_damping", "frame_ratio"
 STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
 MAX_FRAMES = 2  # a mode of the oil column may look like a frame
 ROUGH_EVALUATIONS = 6  # of the fits that only lead to a start
+ROUGH_SHARE = 0.3  # of the energy of the motion, on which those fits look: up to that moment
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
 LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
@@ -156,6 +157,13 @@ class RehearsalProblem:
             block,
             0.1 / size**0.5,
         )
+
+    def cut_beginning(self) -> "RehearsalProblem":
+        """Return the problem of the beginning of the rehearsal, which is quicker to fit."""
+        energy = np.cumsum(self.motion.acceleration_m_s2**2)
+        count = int(np.searchsorted(energy, ROUGH_SHARE * energy[-1])) + LENGTH_STEP
+        count = max(count, math.ceil(MIN_DURATION_S * self.motion.rate_hz) + LENGTH_STEP)
+        return self.from_rehearsal(self.motion.cut(count), self.mass_kg, self.stall_force_n)
 
     def compute_residuals(self, parameters: TableParameters) -> Float1D:
         """Return the residuals of a twin of the table, (residual,)."""
@@ -262,9 +270,9 @@ def fit_basic_twin(
 ) -> TableFit:
     """Fit the twin from nothing, without further effects or with those whose bounds are given.
 
-    First without a frame, whose resonance is narrow; then from the MAX_FRAMES frequencies of the
-    frame at which the misfit has its lowest minima. `trials` are starting values of the parameters
-    of the effects.
+    First on the beginning of the rehearsal without a frame, whose resonance is narrow; then from
+    the MAX_FRAMES frequencies of the frame at which the misfit has its lowest minima. `trials` are
+    starting values of the parameters of the effects.
     """
     bounds = {**BOUNDS, **effect_bounds}
     start = {name: values[0] for name, values in bounds.items()}
@@ -276,9 +284,10 @@ def fit_basic_twin(
         for values in product(*STARTING_VALUES.values())
         for trial in trials
     ]
-    first = starts[int(np.argmin(map_in_threads(problem.measure_misfit, starts)))]
+    beginning = problem.cut_beginning()
+    first = starts[int(np.argmin(map_in_threads(beginning.measure_misfit, starts)))]
     frameless = fit_table(
-        problem,
+        beginning,
         frameless_bounds,
         {name: first[name] for name in frameless_bounds},
         ROUGH_EVALUATIONS,
@@ -286,12 +295,12 @@ def fit_basic_twin(
     )
     start |= frameless.scaled_values
     frames = [start | {"frame_hz": float(hz)} for hz in np.geomspace(*STARTING_FRAMES_HZ)]
-    misfits = np.array(map_in_threads(problem.measure_misfit, frames))
+    misfits = np.array(map_in_threads(beginning.measure_misfit, frames))
     padded = np.pad(misfits, 1, constant_values=math.inf)
     is_minimum = (misfits <= padded[:-2]) & (misfits <= padded[2:])
     count = min(MAX_FRAMES, int(is_minimum.sum()))
     lowest = np.argsort(np.where(is_minimum, misfits, math.inf))[:count].tolist()
-    fits = [fit_table(problem, bounds, frames[k], ROUGH_EVALUATIONS, 1e-2) for k in lowest]
+    fits = [fit_table(beginning, bounds, frames[k], ROUGH_EVALUATIONS, 1e-2) for k in lowest]
     rough = min(fits, key=lambda fit: fit.cost)
     near = fit_table(problem, bounds, rough.scaled_values, tolerance=1e-3)
     return fit_table(problem.with_noise_of(near), bounds, near.scaled_values)
