@@ -479,7 +479,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     is_measured = state.stage.kind == "release"
     if is_measured:
         state = _record_multiplier(state, index)
-    search, config = _search(state), _config(state)
+    search, config, corrected_from = _search(state), _config(state), state.changed_from
     position = search.target.position
     is_given_up = is_measured or search.losses >= config.retries
     lost_points = search.lost_points + (is_given_up and not is_measured)
@@ -509,7 +509,8 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
             "from the specimen, or the table from its level; identify the model from a sweep first",
         )
     if is_last:
-        return end_continuation(replace(state, search=search), trajectory)
+        state = end_continuation(replace(state, search=search), trajectory)
+        return replace(state, changed_from=min(state.changed_from, corrected_from))
     changed = trajectory.end
     at_rest = replace(trajectory.target, level_m_s2=0.0)
     trajectory = trajectory.append_blend(at_rest, position, config.blend_cycles, Label.BLEND)
@@ -519,7 +520,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     measured = (Waypoint(m.reference, m.frequency_hz, m.position) for m in search.measured)
     waypoints = (*_list_leads(config.orbit_plan), *measured)
     state = _approach(replace(state, search=search), trajectory, waypoints, CAPTURE_CYCLES)
-    return replace(state, changed_from=changed)
+    return replace(state, changed_from=min(changed, corrected_from))
 
 
 def end_continuation(state: SequencerState, trajectory: Trajectory) -> SequencerState:
