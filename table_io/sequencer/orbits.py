@@ -280,7 +280,9 @@ def apply_feedback(state: SequencerState, block: Block, earliest: int) -> Sequen
     cycles = feedback.saturated_samples * search.target.frequency_hz / drive.rate_hz
     is_held = state.stage.kind in ("orbit", "release")
     if cycles > MAX_SATURATED_CYCLES and search.is_captured and is_held:
-        return retry_orbit(state, block.end, "the feedback stayed at its limit")
+        due = state.changed_from  # of the correction, earlier than what follows the loss
+        state = retry_orbit(state, block.end, "the feedback stayed at its limit")
+        return replace(state, changed_from=min(state.changed_from, due))
     return state
 
 
@@ -479,7 +481,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     is_measured = state.stage.kind == "release"
     if is_measured:
         state = _record_multiplier(state, index)
-    search, config, corrected_from = _search(state), _config(state), state.changed_from
+    search, config = _search(state), _config(state)
     position = search.target.position
     is_given_up = is_measured or search.losses >= config.retries
     lost_points = search.lost_points + (is_given_up and not is_measured)
@@ -509,8 +511,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
             "from the specimen, or the table from its level; identify the model from a sweep first",
         )
     if is_last:
-        state = end_continuation(replace(state, search=search), trajectory)
-        return replace(state, changed_from=min(state.changed_from, corrected_from))
+        return end_continuation(replace(state, search=search), trajectory)
     changed = trajectory.end
     at_rest = replace(trajectory.target, level_m_s2=0.0)
     trajectory = trajectory.append_blend(at_rest, position, config.blend_cycles, Label.BLEND)
@@ -520,7 +521,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     measured = (Waypoint(m.reference, m.frequency_hz, m.position) for m in search.measured)
     waypoints = (*_list_leads(config.orbit_plan), *measured)
     state = _approach(replace(state, search=search), trajectory, waypoints, CAPTURE_CYCLES)
-    return replace(state, changed_from=min(changed, corrected_from))
+    return replace(state, changed_from=changed)
 
 
 def end_continuation(state: SequencerState, trajectory: Trajectory) -> SequencerState:
