@@ -12,7 +12,7 @@ from table_io.sim.config import SimulatedTableConfig
 from tests.builders.rigs import RIG
 from tests.builders.sessions import play_session
 from tests.builders.truths import seal_truth
-from twin.discovery.discover import PreparedLog, PreparedProblem
+from twin.discovery.discover import PreparedLog, PreparedProblem, prepare_problem
 from twin.discovery.parameters import NuisanceKey
 from twin.discovery.residuals import build_log_residuals
 from twin.discovery.signals import LogSignals, build_signals
@@ -60,6 +60,12 @@ def log(truth: str = "", noise: float = 1.0, gap_mm: float = 4.0) -> PreparedLog
     test = profile(gap_mm)
     readings = build_signals(blocks(truth, noise, gap_mm), "short", 550.0, test.specimen.gaps_m)
     return PreparedLog(readings, test.comparison.contact_n, test.sweep.steps)
+
+
+@cache
+def prepare_bare_log() -> PreparedProblem:
+    """The problem of the recording that hides nothing; not to be changed."""
+    return prepare_problem([log()], SNM)
 
 
 def distort(signals: LogSignals) -> LogSignals:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Int1D, Label
-from tests.discovery.played import SNM, format_truth, log
+from tests.discovery.played import SNM, format_truth, log, prepare_bare_log
 from tests.input_errors import raises_input_error
 from tests.recovery.recordings import log_columns, oscillator
 from tests.studies.blind.oracle import fit_known_effects
@@ -36,6 +36,8 @@ from twin.discovery.units import assign_folds
 from twin.discovery.verdict import DiscoveryVerdict, closed_fraction, judge_selection
 from twin.laws.library import EFFECTS
 
+FRICTIONS = ("coulomb_friction", "bouc_wen", "stribeck_friction")
+
 
 @cache
 def discover(truth: str) -> Discovery:
@@ -43,8 +45,14 @@ def discover(truth: str) -> Discovery:
     return discover_effects([log(truth)], SNM)
 
 
+def all_but(*effects: str) -> tuple[str, ...]:
+    """What to leave out of the library where these effects are enough: the whole takes a minute."""
+    assert {*effects} <= {effect.id for effect in EFFECTS}
+    return tuple(effect.id for effect in EFFECTS if effect.id not in effects)
+
+
 def test_where_nothing_is_hidden_nothing_is_named() -> None:
-    discovery = discover_effects([log()], SNM)
+    discovery = discover("")
     assert discovery.verdict.outcome == "none"
     assert discovery.verdict.best.effects == ()
     assert 0.7 < discovery.prepared.problem.measure_misfit(discovery.selection.null) < 1.1
@@ -152,9 +160,7 @@ def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
 
 def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> None:
     truth = format_truth("table_tilt", tilt=10.0) + format_truth("bumper_hardening", k2=3e7)
-    library = {"table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction"}
-    # with the whole library it takes a minute
-    without = [effect.id for effect in EFFECTS if effect.id not in library]
+    without = all_but("table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction")
     selection = discover_effects([log(truth, noise=20.0)], SNM, without=without).selection
     assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
     null, tilted = selection.null.cost, selection.tried[0].cost
@@ -202,11 +208,19 @@ def test_a_channel_that_was_not_tared_hides_no_law() -> None:
     assert offset == pytest.approx(400.0, rel=0.02)
 
 
-def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
+@pytest.mark.parametrize(
+    "without",
+    [
+        all_but("maxwell_damper", "quadratic_damping", "position_damping", "cubic_stiffness"),
+        pytest.param(FRICTIONS, marks=pytest.mark.slow),
+    ],
+    ids=["rivals of the damper", "whole library"],
+)
+def test_without_the_truth_in_the_library_nothing_is_named_with_confidence(
+    without: tuple[str, ...],
+) -> None:
     prepared = log(format_truth("coulomb_friction", fc=30.0))
-    discovery = discover_effects(
-        [prepared], SNM, without=("coulomb_friction", "bouc_wen", "stribeck_friction")
-    )
+    discovery = discover_effects([prepared], SNM, without=without)
     assert discovery.verdict.outcome == "unexplained"
 
 
@@ -221,7 +235,7 @@ def test_the_place_of_the_disagreement() -> None:
 
 def test_a_misfit_of_one_side_has_its_place_there() -> None:
     prepared = log()
-    problem = prepare_problem([prepared], SNM)
+    problem = prepare_bare_log()
     (residuals,) = problem.problem.log_residuals
     sampled = resolve_samples(residuals, problem.parameters)
     entries = np.random.default_rng(0).standard_normal(sampled.entry_row.size)

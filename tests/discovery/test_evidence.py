@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from table_io.block import Float2D
-from tests.discovery.played import SNM, log
+from tests.discovery.played import prepare_bare_log
 from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
-from twin.discovery.discover import prepare_problem
 from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, Variant, build_evidence
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
@@ -20,7 +19,7 @@ ENTRIES, FORCE = 400, 100.0
 @cache
 def list_laws() -> tuple[Candidate, ...]:
     """Candidates of the library with one shape, which only lend their names."""
-    library = prepare_problem([log()], SNM).problem.library
+    library = prepare_bare_log().problem.library
     return tuple(law for law in library if len(law.shapes) == 1)
 
 
@@ -89,6 +88,6 @@ def test_a_place_that_only_noise_reaches_is_no_unknown_force(
         return {"here": [np.full((3, size), float(is_copy)), np.ones((3, size))]}
 
     monkeypatch.setattr(evidence, "compute_stranger_forces", compute_forces)
-    prepared = prepare_problem([log()], SNM)
+    prepared = prepare_bare_log()
     linear = build_evidence(prepared.problem.log_residuals, prepared.parameters, (), {})
     assert linear.places["here"].size == 1

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from tests.discovery.played import SNM, format_truth, idealize, imperfect_log, log
+from tests.discovery.played import SNM, format_truth, idealize, imperfect_log, log, prepare_bare_log
 from tests.recovery.recordings import log_columns, oscillator
 from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
@@ -29,7 +29,7 @@ def search(truth):
 
 class TestTerms:
     def test_every_family_is_a_law_on_any_scale(self):
-        prepared = prepare_problem([log()], SNM)
+        prepared = prepare_bare_log()
         scale = prepared.problem.log_residuals[0].scale
         candidates = list_law_candidates(scale, has_contact=True)
         assert len({candidate.name for candidate in candidates}) == len(FAMILIES)
@@ -47,7 +47,7 @@ class TestTerms:
         assert len(candidates) == len(FAMILIES)
 
     def test_laws_of_bumpers_need_contact(self):
-        scale = prepare_problem([log()], SNM).problem.log_residuals[0].scale
+        scale = prepare_bare_log().problem.log_residuals[0].scale
         free = list_law_candidates(scale, has_contact=False)
         assert all(
             candidate.effect and candidate.effect.place in ("damper", "input") for candidate in free
@@ -58,7 +58,7 @@ class TestExpressions:
     """Symbolic regression, whose expressions become terms as all others."""
 
     def make(self, text, place="damper"):
-        scale = prepare_problem([log()], SNM).problem.log_residuals[0].scale
+        scale = prepare_bare_log().problem.log_residuals[0].scale
         u, v = np.random.default_rng(1).uniform(-1.0, 1.0, (2, 200))
         names = ["(u / u0)" if place == "damper" else "(d / d0)", "(v / v0)"]
         return make_term(place, ast.parse(text, mode="eval").body, names, [u, v], scale, 0)
@@ -171,7 +171,9 @@ def test_a_term_that_stood_in_for_another_is_dropped(monkeypatch):
         lambda scale, has_contact: list_terms(scale, "resonator", "table_resonator"),
     )  # fmt: skip
     truth = {"mass": 27.0, "frequency": 4.1, "coupling": 19e3}
-    prepared = idealize(prepare_problem([log(format_truth("table_resonator", **truth))], SNM))
+    prepared = idealize(
+        prepare_problem([log(format_truth("table_resonator", "", "", **truth))], SNM)
+    )
     null = prepared.problem.fit_effects(prepared.parameters, ())
     fitted_sets = search_laws(prepared.problem, null, null)
     single = next(each for each in fitted_sets if each.names == ("law_table_resonator",))

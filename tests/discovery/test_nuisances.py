@@ -17,6 +17,7 @@ from tests.discovery.played import (
     format_truth,
     imperfect_log,
     log,
+    prepare_bare_log,
 )
 from twin.discovery.discover import (
     PreparedProblem,
@@ -40,6 +41,11 @@ from twin.discovery.residuals import Nuisance
 @cache
 def explain_imperfect_log() -> PreparedProblem:
     return prepare_problem([imperfect_log()], SNM)
+
+
+@cache
+def prepare_quiet_log() -> PreparedProblem:
+    return prepare_problem([log(noise=0.2)], SNM)
 
 
 def nuisance_values(prepared: PreparedProblem) -> Mapping[NuisanceKey, float]:
@@ -114,7 +120,7 @@ def test_unequal_cells_blame_no_cell_and_move_no_parameter() -> None:
 )  # fmt: skip
 def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str]) -> None:
     """Signals corrected by one typical size change the residual by the column."""
-    problem = prepare_problem([log(noise=0.2)], SNM)
+    problem = prepare_quiet_log()
     parameters = problem.parameters
     residuals = linearize_nuisances(problem.problem.log_residuals[0], parameters)
     terms = residuals.nuisances
@@ -130,7 +136,7 @@ def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str])
 
 def test_a_prior_holds_every_nuisance() -> None:
     """Its entries are the values: an error four times the typical one costs eight of evidence."""
-    prepared = prepare_problem([log()], SNM)
+    prepared = prepare_bare_log()
     residuals = prepared.problem.log_residuals[0]
     values = nuisance_values(prepared)
     entries = residuals.evaluate(prepared.parameters)[-len(values) :]

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from tests.discovery.played import SNM, log
-from twin.discovery.discover import prepare_problem
+from tests.discovery.played import prepare_bare_log
 from twin.discovery.least_squares import FitResult
 from twin.discovery.model_file import format_fitted_model
 from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
@@ -13,7 +12,7 @@ from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
 
 @pytest.fixture(scope="module")
 def fit() -> FitResult:
-    return prepare_problem([log()], SNM).first_fit
+    return prepare_bare_log().first_fit
 
 
 @pytest.mark.parametrize(
