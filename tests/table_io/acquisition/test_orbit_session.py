@@ -25,6 +25,7 @@ from tests.builders.profiles import make_history_profile
 from tests.builders.rigs import RIG
 from tests.builders.sessions import PlayedSession, play_session
 from tests.input_errors import raises_input_error
+from tests.studies.held_orbits import play, read
 from tests.table_io.sim.plant_orbits import trace_orbits
 
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
@@ -177,6 +178,13 @@ def test_lost_orbit_is_left_for_rest_and_found_again(monkeypatch: pytest.MonkeyP
     assert point.accepted
     assert math.isnan(point.multiplier)
     assert point.multiplier_sd is None
+
+
+@pytest.mark.slow  # 20 s
+def test_command_stays_below_its_stated_bound_where_an_orbit_is_lost(tmp_path: Path) -> None:
+    """The correction of the block that loses the orbit is written to its end: no sample jumps."""
+    test = play(read(tmp_path, "slow_clock", level=0.0585, gap=3.97, points=2))
+    assert test.level_m_s2 < test.peak_m_s2 <= test.bound_m_s2
 
 
 def assert_left_for_rest(lost: PlayedSession, event: Event) -> None:
