@@ -83,14 +83,14 @@ def test_record_beyond_the_rig_states_the_largest_scale(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("high_hz", "duration_s", "said"), [(201.0, 30.0, "rate_hz"), (200.0, 46.0, "45 s")]
+    ("high_hz", "duration_s", "message"), [(201.0, 30.0, "rate_hz"), (200.0, 46.0, "45 s")]
 )
 def test_record_that_its_test_cannot_play_is_refused(
-    high_hz: float, duration_s: float, said: str, tmp_path: Path
+    high_hz: float, duration_s: float, message: str, tmp_path: Path
 ) -> None:
     path = write_spectrum(tmp_path, [(1.0, 0.1), (2.0, 0.3), (high_hz, 0.12)])
     shape = RecordShape(duration_s=duration_s)
-    with pytest.raises(InputError, match=said) as refused:
+    with pytest.raises(InputError, match=message) as refused:
         compute_spectrum_records(SpectrumRecordOptions(path, Path("el_centro"), shape))
     assert refused.value.where == str(path)
 
