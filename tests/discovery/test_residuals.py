@@ -1,6 +1,7 @@
 """Residuals: at the samples that they use they are those of the whole motion."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -52,3 +53,19 @@ def test_ringing_before_a_step_of_the_force_is_neither_contact_nor_tension() -> 
         pulls = entries[residuals.entry_row == residuals.rows.index(name)]
         assert pulls.size > 200
         assert np.mean(pulls**2) < 1.0
+
+
+def test_forces_are_fitted_up_to_where_they_exceed_the_noise_of_the_motion() -> None:
+    """The stiff bumper makes force of the noise of a laser, at every frequency."""
+    prepared, parameters = log(), ParameterSet.from_model(SNM, 1)
+    bands = []
+    for factor in (1.0, 10.0):
+        noise = {name: factor * values for name, values in prepared.signals.noise.items()}
+        signals = replace(prepared.signals, noise=noise)
+        (residuals,) = build_log_residuals([(signals, prepared.contact_n)], SNM)
+        bands.append(residuals.with_row_bands(parameters).row_bands)
+    quiet, loud = bands
+    assert {*quiet} == {*FORCE_ROWS}
+    for name in FORCE_ROWS:
+        assert 1.0 < loud[name] <= quiet[name] <= prepared.signals.band_hz
+    assert loud["right"] < 0.8 * quiet["right"]

@@ -2,12 +2,14 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.studies.evidence.imported import format_profile, import_columns
 from tests.studies.evidence.laboratory import Instruments, Specimen, StepTest, record
 from twin.discovery.discover import prepare_problem
 from twin.discovery.loading import load_logs
+from twin.discovery.noise import number_bands
 from twin.discovery.nuisances import list_sizes, widen_intervals
 from twin.discovery.parameters import STIFFNESS, BaseKey, GapKey
 from twin.model.model import Model
@@ -63,3 +65,16 @@ def test_bumpers_that_the_mass_does_not_reach_are_no_parameters(tmp_path: Path) 
     names = {free.name for free in fit.free if isinstance(free.key, BaseKey | GapKey)}
     assert names == {"stiffness", "damping"}
     assert fit.values[STIFFNESS] == pytest.approx(specimen.k, rel=0.02)
+
+
+def test_hum_that_beats_is_noise_at_its_frequency_alone(tmp_path: Path) -> None:
+    """What its removal leaves does not repeat between cycles; an appendage of 49 Hz was named."""
+    specimen, test = Specimen(gap_mm=-1.0), StepTest(2.0, 9.0, 1.0, 10)
+    columns = record(specimen, Instruments(filter_share=0.25, hum=3.0, beat_hz=0.3), 7, test)
+    logs, _ = load_logs([import_columns(columns, tmp_path, format_profile(specimen, test))])
+    (residuals,) = prepare_problem(logs, START).problem.log_residuals
+    at_hum, elsewhere = number_bands(np.array([50.0, 20.0]))
+    for side in ("right cells", "left cells"):
+        scale = residuals.noise_scale[side]
+        assert scale[at_hum] > 1.5 * scale[elsewhere]
+        assert scale[elsewhere] < 1.3

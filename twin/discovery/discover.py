@@ -132,7 +132,11 @@ def prepare_problem(
     _check_enough_data(log_residuals)
     parameters = initialize_parameters(log_residuals, model)
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
-    log_residuals = build_log_residuals(pairs, first.parameters.to_model())
+    fitted = first.parameters
+    log_residuals = tuple(
+        residuals.with_row_bands(fitted)
+        for residuals in build_log_residuals(pairs, fitted.to_model())
+    )
     notes = []
     if (thinned := log_residuals[0].thinning) > 1:
         notes.append(

@@ -7,13 +7,14 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import spectrogram, welch
 
-from table_io.block import Bool2D, Float1D
+from table_io.block import Bool2D, Float1D, Int1D
 from twin.compare.hum import separate_hum
 
 MIN_REST_SAMPLES = 100
 SEGMENT_SAMPLES = 256  # of a spectrum; 50 % overlap
 LONG_SEGMENT_SAMPLES = 8192  # of a residual: resolves slow drift
 BANDS_PER_OCTAVE = 3
+BAND_COUNT = 60  # up to 0.8 MHz
 QUIET_SHARE = 0.3  # of the segments in motion that count as quiet
 MIN_DEVIATION_SIGMA = 3.0  # standard deviations: a smaller deviation from white noise is chance
 # The same for 1/f noise, which the few lowest lines show: their power is far from normal.
@@ -57,6 +58,13 @@ class RestNoise:
     resolution: float
     roll_off_hz: float
     filter_hz: float
+
+
+def number_bands(hz: Float1D) -> Int1D:
+    """Return the number of the band of each frequency, (frequency,): from 0, which ends at 1 Hz."""
+    octaves = np.log2(np.maximum(hz, 2.0 ** (-1 / BANDS_PER_OCTAVE)))
+    numbers: Int1D = np.floor(BANDS_PER_OCTAVE * octaves).astype(np.int64) + 1
+    return numbers
 
 
 def estimate_noise_density(values: Float1D, rest: Bool2D, frequency: Float1D) -> Float1D:
@@ -246,11 +254,14 @@ def _count_passed_bands(bands: NoiseBands, roll_off: float) -> int:
 
 
 def _find_white_level(power: Float1D, sigma: Float1D) -> float:
-    """Return the lowest power of the wide bands: the motion only adds to it.
+    """Return the mean power of the wide bands that are as low as the lowest: motion only adds.
 
-    The least of the narrow bands is low by chance.
+    The least of the narrow bands is low by chance, and so is the lowest band alone.
     """
-    return float(power[sigma <= 2.0 * sigma.min()].min())
+    is_wide = sigma <= 2.0 * sigma.min()
+    lowest = power[is_wide].min()
+    is_low = is_wide & (power <= lowest * (1.0 + MIN_DEVIATION_SIGMA * sigma))
+    return float(np.average(power[is_low], weights=sigma[is_low] ** -2.0))
 
 
 def _compare_with_rest(rest: NoiseBands, white: float, highest: float) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from twin.discovery.motion import (
     RecordScale,
     measure_scale,
 )
+from twin.discovery.noise import BAND_COUNT, number_bands
 from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet
 from twin.discovery.signals import LogSignals, derives_acc
 from twin.model.inverse_dynamics import depends_on_history, forces_along
@@ -61,6 +62,9 @@ MIN_CHANGES = 8  # values of a step that show the noise
 CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
+# Power of the forces of a row over its noise, up to the highest frequency of its facts: with less,
+# noise of the motion would shift its slopes by a larger share than the inverse.
+MIN_FACT_RATIO = 16.0
 MAX_SAMPLES = 120_000  # moving samples of all logs together; limits time and memory
 
 
@@ -137,13 +141,15 @@ class LogResiduals:
     thinning: int = 1  # keep one in `thinning` of the cycles of a step and of the other blocks
     nuisances: NuisanceTerms | None = None
     known_contact: npt.NDArray[np.int8] | None = None  # (2, sample), else from the load cells
-    # What repeated cycles show of the noise of each row, over that of the sensors.
-    noise_scale: Mapping[str, float] = field(default_factory=dict)
+    # What repeated cycles show of the noise of each row, over that of the sensors, (band,).
+    noise_scale: Mapping[str, Float1D] = field(default_factory=dict)
     # Of the residuals that these are a copy of: noise of the rows, and samples of each row.
     fixed_noise: tuple[Float1D, ...] | None = None
     fixed_mask: Bool2D | None = None
     # Mean square of the entries of each row, by name, of noise and unknown errors alone.
     expected_squares: Mapping[str, float] = field(default_factory=dict)
+    # Highest frequency of the facts of each force row in Hz, by name.
+    row_bands: Mapping[str, float] = field(default_factory=dict)
     is_sampled: bool = False  # entries are samples, for maps and subsets, in place of facts
     motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
 
@@ -329,10 +335,32 @@ class LogResiduals:
             None
             if name in PULL_ROWS
             else BlockBasis(
-                _split_at_gaps(samples, block.get(name, self.sample_block)), rate_hz, self.band_hz
+                _split_at_gaps(samples, block.get(name, self.sample_block)),
+                rate_hz,
+                self.row_bands.get(name, self.band_hz),
             )
             for name, samples in zip(self.rows, self._row_samples, strict=True)
         )
+
+    def with_row_bands(self, parameters: ParameterSet) -> "LogResiduals":
+        """Return the residuals up to where the measured forces of each row exceed its noise.
+
+        It is the noise that they show about a fitted model. Above that frequency a row is noise of
+        the motion, which the parameters of a model scale.
+        """
+        learned = self.with_learned_noise(parameters)
+        measured = learned.measured_entries * learned.entry_weight
+        bands, first = {}, 0
+        for name, basis in zip(FORCE_ROWS, self.bases, strict=False):
+            if basis is None or not basis.size:
+                continue
+            number = number_bands(basis.frequency_hz)
+            squares = measured[first : first + basis.size] ** 2
+            first += basis.size
+            power = np.bincount(number, squares) / np.maximum(np.bincount(number), 1)
+            loud = number <= np.flatnonzero(power > MIN_FACT_RATIO).max(initial=0)
+            bands[name] = float(basis.frequency_hz[loud].max(initial=0.0))
+        return replace(self, row_bands=bands)
 
     @cached_property
     def _entry_samples(self) -> tuple[Int1D, ...]:
@@ -616,9 +644,18 @@ class LogResiduals:
                 is_whitened = k == 0 and self.whitening is not None
                 noise[k] = in_band[self.rows[k]] if is_whitened else self._fact_noise(k, basis)
         return tuple(
-            self.noise_scale.get(PULLING_CELLS.get(name, name), 1.0) * each
-            for name, each in zip(self.rows, noise, strict=True)
+            each * self._scale_of(PULLING_CELLS.get(name, name), basis)
+            for name, each, basis in zip(self.rows, noise, self.bases, strict=True)
         )
+
+    def _scale_of(self, name: str, basis: BlockBasis | None) -> Float1D:
+        """Return the noise scale of a row at its facts, (fact,); of samples the mean, (1,)."""
+        if name not in self.noise_scale:
+            return np.ones(1)
+        if basis is not None:
+            return self.noise_scale[name][number_bands(basis.frequency_hz)]
+        hz = self.signals.omega / (2.0 * np.pi)
+        return np.sqrt(np.mean(self.noise_scale[name][number_bands(hz)] ** 2, keepdims=True))
 
     @cached_property
     def _entry_noise(self) -> Float1D:
@@ -663,10 +700,9 @@ class LogResiduals:
         for rows in (sensors, forces):
             scale = dict(learned.noise_scale)
             for row in rows:
-                change = learned._measure_change(row, r / louder)
-                if change > 1.0:
-                    name = self.rows[row]
-                    scale[name] = scale.get(name, 1.0) * math.sqrt(change)
+                change = np.maximum(learned._measure_change(row, r / louder), 1.0)
+                name = self.rows[row]
+                scale[name] = scale.get(name, np.ones(BAND_COUNT)) * np.sqrt(change)
             learned = replace(learned, noise_scale=scale)
             louder[: r.size - self._rest_entry_count] = learned._entry_noise / self._entry_noise
         terms = self.nuisances
@@ -724,31 +760,46 @@ class LogResiduals:
         large = float(squares.sum() ** 2 / max(squares @ squares, 1e-300))
         return max(large / (cycles if steps else 1.0), 1.0)
 
-    def _measure_change(self, row: int, r: Float1D) -> float:
-        """Return the mean square over the noise that a row does not repeat; 1 if unknown.
+    def _measure_change(self, row: int, r: Float1D) -> Float1D:
+        """Return the mean square over the noise that a row does not repeat, (band,); 1 if unknown.
 
+        Bands with too few components are as the nearest ones.
         A motion that changes from cycle to cycle changes what a missing law leaves, by as large a
         share as the force, or `CHANGE_ORDER` times that for a law of so high an order.
         """
         basis, facts = self.bases[row], np.flatnonzero(self.entry_row == row)
         if basis is None or not facts.size:
-            return 1.0
+            return np.ones(BAND_COUNT)
         sample, m = self.entry_sample[facts], self.motion()
         measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
-        variances = []
+        variances: dict[int, list[float]] = {}
         force = self.measured_entries[facts] * self.entry_weight[facts]
         for number in np.unique(m.step[sample][measured]):
             chosen = measured & (m.step[sample] == number)
             cycles, index = np.unique(m.cycle[sample][chosen], return_inverse=True)
-            table = np.full((2, cycles.size, int(basis.order[chosen].max(initial=0)) + 1), np.nan)
-            table[:, index, basis.order[chosen]] = r[facts[chosen]], force[chosen]
+            order = basis.order[chosen]
+            table = np.full((2, cycles.size, int(order.max(initial=0)) + 1), np.nan)
+            table[:, index, order] = r[facts[chosen]], force[chosen]
             changes = np.diff(table, axis=1)
-            if np.isfinite(changes[0]).sum() >= MIN_CHANGES:
-                changed, changed_force = 0.5 * np.nanmean(changes**2, axis=(1, 2))
-                square, force_square = np.nanmean(table**2, axis=(1, 2))
-                share = changed_force / max(force_square, 1e-300)
-                variances.append(changed - CHANGE_ORDER**2 * share * square)
-        return float(np.median(variances)) if variances else 1.0
+            if np.isfinite(changes[0]).sum() < MIN_CHANGES:
+                continue
+            changed_force = 0.5 * float(np.nanmean(changes[1] ** 2))
+            share = changed_force / max(float(np.nanmean(table[1] ** 2)), 1e-300)
+            bands = np.zeros(table.shape[2], dtype=np.int64)
+            bands[order] = number_bands(basis.frequency_hz[chosen])
+            for band in np.unique(bands[order]):
+                own = changes[0][:, bands == band]
+                if np.isfinite(own).sum() >= MIN_CHANGES:
+                    square = float(np.nanmean(table[0][:, bands == band] ** 2))
+                    change = 0.5 * float(np.nanmean(own**2))
+                    variances.setdefault(int(band), []).append(
+                        change - CHANGE_ORDER**2 * share * square
+                    )
+        if not variances:
+            return np.ones(BAND_COUNT)
+        known = sorted(variances)
+        medians = [float(np.median(variances[band])) for band in known]
+        return np.interp(np.arange(BAND_COUNT), known, medians)
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
@@ -787,14 +838,7 @@ class LogResiduals:
         damper, right, left = forces
         if not m.has_load_cells and m.damper is None:
             damper = damper + right - left
-        rows = [
-            -values[samples]
-            for values, samples in zip((damper, right, left), self._row_samples, strict=False)
-        ]
-        if self.whitening is not None:
-            whole = np.where(m.good, -damper / self.signals.mass_kg, 0.0)
-            rows[0] = self.signals.grid.apply_gain(whole, self.whitening)[self._row_samples[0]]
-        return self._fill_entries(rows)
+        return self._enter_rows(-np.array([damper, right, left]))
 
     @cached_property
     def measured_entries(self) -> Float1D:
@@ -802,13 +846,15 @@ class LogResiduals:
 
         Their norm tells how large a force is beside the noise.
         """
-        m = self.motion()
-        measured = np.nan_to_num(self.measured_forces(m, self.signals.mass_kg))
-        rows = [
-            values[samples] for values, samples in zip(measured, self._row_samples, strict=False)
-        ]
+        return self._enter_rows(
+            np.nan_to_num(self.measured_forces(self.motion(), self.signals.mass_kg))
+        )
+
+    def _enter_rows(self, forces: Float2D) -> Float1D:
+        """Return entries over the noise, (entry,), from forces of the three rows, (3, sample)."""
+        rows = [values[samples] for values, samples in zip(forces, self._row_samples, strict=False)]
         if self.whitening is not None:
-            whole = np.where(m.good, measured[0] / self.signals.mass_kg, 0.0)
+            whole = np.where(self.motion().good, forces[0] / self.signals.mass_kg, 0.0)
             rows[0] = self.signals.grid.apply_gain(whole, self.whitening)[self._row_samples[0]]
         return self._fill_entries(rows)
 

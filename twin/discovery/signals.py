@@ -29,6 +29,7 @@ from twin.discovery.noise import (
     estimate_noise_density,
     find_loudest_power,
     measure_rest_noise,
+    number_bands,
 )
 from twin.model.model import SensorModel
 
@@ -225,14 +226,19 @@ class LogSignals:
         """Rms noise of the motion and of the forces, SI."""
         return self._fusion.motion_noise
 
-    def with_louder_channels(self, scale: Mapping[str, float]) -> "LogSignals":
-        """Return the signals with the noise that the rows of sensors show, over that known."""
-        louder = dict.fromkeys(self.channels, 1.0)
+    def with_louder_channels(self, scale: Mapping[str, Float1D]) -> "LogSignals":
+        """Return the signals with the noise that the rows of sensors show, over that known.
+
+        `scale` are factors by row, (band,).
+        """
+        bands = number_bands(self.omega / (2.0 * np.pi))
+        noise = dict(self.noise)
         for row, channels in {**SENSOR_PAIRS, **CELL_PAIRS}.items():
-            for channel in channels:
-                if channel in louder:
-                    louder[channel] = max(louder[channel], scale.get(row, 1.0))
-        return replace(self, noise={c: louder[c] * noise for c, noise in self.noise.items()})
+            for channel in channels if row in scale else ():
+                if channel in noise:
+                    louder = self.noise[channel] * scale[row][bands]
+                    noise[channel] = np.maximum(noise[channel], louder)
+        return replace(self, noise=noise)
 
     def add_noise(self) -> "LogSignals":
         """Return the signals with noise of the known density added to every channel."""
