@@ -9,7 +9,7 @@ import pytest
 from tests.discovery.played import SNM, format_truth, log
 from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet
-from twin.discovery.residuals import FORCE_ROWS, PULL_ROWS, build_log_residuals
+from twin.discovery.residuals import CONTACT_ROWS, FORCE_ROWS, PULL_ROWS, build_log_residuals
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_forces_are_fitted_up_to_where_they_exceed_the_noise_of_the_motion() -> 
         (residuals,) = build_log_residuals([(signals, prepared.contact_n)], SNM)
         bands.append(residuals.with_row_bands(parameters).row_bands)
     quiet, loud = bands
-    assert {*quiet} == {*FORCE_ROWS}
-    for name in FORCE_ROWS:
+    assert {*quiet} == {*CONTACT_ROWS}
+    for name in CONTACT_ROWS:
         assert 1.0 < loud[name] <= quiet[name] <= prepared.signals.band_hz
     assert loud["right"] < 0.8 * quiet["right"]

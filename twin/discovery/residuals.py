@@ -343,20 +343,20 @@ class LogResiduals:
         )
 
     def with_row_bands(self, parameters: ParameterSet) -> "LogResiduals":
-        """Return the residuals up to where the measured forces of each row exceed its noise.
+        """Return the residuals up to where the forces of bumpers exceed the noise of their rows.
 
-        It is the noise that they show about a fitted model. Above that frequency a row is noise of
-        the motion, which the parameters of a model scale.
+        It is the noise that they show about a fitted model. Above that frequency these rows are
+        noise of the motion, which the parameters of the bumpers scale.
         """
         learned = self.with_learned_noise(parameters)
         measured = learned.measured_entries * learned.entry_weight
-        bands, first = {}, 0
-        for name, basis in zip(FORCE_ROWS, self.bases, strict=False):
-            if basis is None or not basis.size:
+        bands = {}
+        for row, name in enumerate(FORCE_ROWS):
+            basis = self.bases[row]
+            if name not in CONTACT_ROWS or basis is None or not basis.size:
                 continue
             number = number_bands(basis.frequency_hz)
-            squares = measured[first : first + basis.size] ** 2
-            first += basis.size
+            squares = measured[learned.entry_row == row] ** 2
             power = np.bincount(number, squares) / np.maximum(np.bincount(number), 1)
             loud = number <= np.flatnonzero(power > MIN_FACT_RATIO).max(initial=0)
             bands[name] = float(basis.frequency_hz[loud].max(initial=0.0))
