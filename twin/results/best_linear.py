@@ -15,7 +15,6 @@ from scipy import stats
 from scipy.interpolate import CubicSpline
 
 from table_io.block import Float1D, Int1D
-from table_io.config.excitation import DRIVE_MARGIN_S, history_acceleration
 from table_io.config.excitation.synthetic import PeriodicMultisine
 from table_io.config.profile import Profile
 from twin.recording.reader import Recording
@@ -36,22 +35,27 @@ def estimate_best_linear(recording: Recording, profile: Profile) -> list[BestLin
 
     Empty of other excitations, and if the test did not play every period.
     """
-    excitation, motion = profile.excitation, find_table_motion(recording, profile)
-    if not isinstance(excitation, PeriodicMultisine) or motion is None:
+    excitation = profile.excitation
+    if not isinstance(excitation, PeriodicMultisine):
+        return []
+    motion = find_table_motion(recording, profile)
+    if motion is None:
         return []
     rate_hz = motion.rate_hz
-    starts = excitation.list_starts(rate_hz)
-    starts = starts + (0 if excitation.drive is None else round(DRIVE_MARGIN_S * rate_hz))
+    starts = motion.start - motion.first + excitation.list_starts(rate_hz)
     count = round(excitation.duration_s * rate_hz)
-    if motion.start + int(starts[-1, -1]) + count > motion.end:
+    if int(starts[-1, -1]) + count > motion.end - motion.first:
         return []
-    first, blocks = motion.start, recording.contiguous_blocks("meas")
     lines = excitation.list_lines(rate_hz)
     shown = np.arange(lines[0], lines[-1] + 1)
+    blocks = recording.contiguous_blocks("meas")
+    rows = {
+        COMMAND: motion.target_acc_m_s2,
+        "table_acc_m_s2": motion.achieved_acc_m_s2,
+        "mass_acc_m_s2": extract_channel(blocks, "mass_acc_m_s2", motion.first, motion.end),
+    }
     spectra: dict[str, Spectra] = {}
-    command = history_acceleration(excitation.target(rate_hz), rate_hz)
-    for name in dict.fromkeys(name for pair in PAIRS for name in pair):
-        row = command if name == COMMAND else extract_channel(blocks, name, first, motion.end)
+    for name, row in rows.items():
         parts = row[starts[..., None] + np.arange(count)]
         if np.isfinite(parts).all():
             spectra[name] = np.fft.rfft(parts)[..., shown] * (2.0 / count)

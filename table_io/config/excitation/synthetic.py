@@ -8,7 +8,12 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from table_io.block import Float1D, Int1D
 from table_io.config.base import Count, NonNegative, Number, Positive
-from table_io.config.excitation import MIN_BLEND_CYCLES, History, register_excitation
+from table_io.config.excitation import (
+    DRIVE_MARGIN_S,
+    MIN_BLEND_CYCLES,
+    History,
+    register_excitation,
+)
 from table_io.config.excitation.waveform import (
     LevelPoints,
     check_level_points,
@@ -155,10 +160,11 @@ class PeriodicMultisine(BandLimitedRandom):
         return np.delete(lines, DETECTION_GROUP * np.arange(groups) + left_out)
 
     def list_starts(self, rate_hz: float) -> npt.NDArray[np.int64]:
-        """Return the first samples of the measured periods, (realisation, period)."""
+        """Return the first samples of the measured periods in its target, (realisation, period)."""
         count, ramp = round(self.duration_s * rate_hz), round(self.ramp_s * rate_hz)
         whole = (self.periods + 1) * count + 2 * ramp + 1
-        first = whole * np.arange(self.realisations) + ramp + count
+        before = round(DRIVE_MARGIN_S * rate_hz) if self.drive is not None else 0
+        first = whole * np.arange(self.realisations) + before + ramp + count
         return np.asarray(first[:, None] + count * np.arange(self.periods))
 
     def displacement(self, rate_hz: float) -> Float1D:
