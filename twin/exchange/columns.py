@@ -276,6 +276,11 @@ def _read_clock(table: ForeignTable, sources: dict[str, ColumnSource], size: int
     return first
 
 
+def is_added_column(name: str) -> bool:
+    """Return True for a column that a table of a log has in addition to time and channels."""
+    return name in (*LABEL_UNITS, UNIX_TIME_COLUMN) or name.startswith(TWIN_PREFIX)
+
+
 def _select_columns(
     table: ForeignTable, column_map: ColumnMap | None, known: ImportColumns, leave_out: bool
 ) -> tuple[dict[str, ColumnSource], list[str]]:

@@ -30,9 +30,14 @@ from table_io.formats.words import (
     split_words,
 )
 from table_io.units import UNITS
-from twin.exchange.columns import CANONICAL_COLUMNS, ColumnMap, ColumnSource, ImportColumns
+from twin.exchange.columns import (
+    CANONICAL_COLUMNS,
+    ColumnMap,
+    ColumnSource,
+    ImportColumns,
+    is_added_column,
+)
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
-from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, UNIX_TIME_COLUMN
 
 BODY_WORDS = {
     "command": {"cmd", "command", "commanded", "reference", "ref", "drive", "setpoint", "target"},
@@ -142,11 +147,7 @@ def propose_map(
             stated["rate_hz"], file_hz, table.path, table.kind, MAX_INTERVAL_ERROR, "rate_hz"
         )
     table = replace(table, facts=table.facts | stated)
-    names = [
-        name
-        for name in _select_recording(table)
-        if name not in (*LABEL_UNITS, UNIX_TIME_COLUMN) and not name.startswith(TWIN_PREFIX)
-    ]
+    names = [name for name in _select_recording(table) if not is_added_column(name)]
     quantities = {name: find_quantity(name, table.columns[name].unit) for name in names}
     questions: list[str] = []
     alternatives: dict[str, tuple[str, ...]] = {}
@@ -210,7 +211,7 @@ def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:
         return
     usual = table.columns[names[0]]
     for name, column in table.columns.items():
-        is_known = name in (*names, *LABEL_UNITS, UNIX_TIME_COLUMN) or name.startswith(TWIN_PREFIX)
+        is_known = name in names or is_added_column(name)
         if is_known or find_quantity(name, column.unit) not in CHANNELS_OF:
             continue
         if column.rate_hz and usual.rate_hz and column.rate_hz != usual.rate_hz:

@@ -14,7 +14,8 @@ import numpy as np
 from table_io.block import Float1D, Float2D, Label
 from table_io.channels import TIME_COLUMN
 from table_io.control.order_tracking import Complex1D, track_harmonics
-from twin.recording.tabular import DIRECTION_SIGNS, LABEL_UNITS, TWIN_PREFIX, LogTable
+from twin.exchange.columns import is_added_column
+from twin.recording.tabular import DIRECTION_SIGNS, LogTable
 
 REFERENCE = "table_acc_m_s2"
 SPECTRUM_WINDOW_S = 4.0  # of a spectrogram: lines 0.25 Hz apart
@@ -31,11 +32,7 @@ class SweepResponse:
 
 def list_measured_channels(rows: LogTable) -> list[str]:
     """Return the columns that were measured, without time and labels."""
-    return [
-        name
-        for name in rows.units
-        if name not in (TIME_COLUMN, *LABEL_UNITS) and not name.startswith(TWIN_PREFIX)
-    ]
+    return [name for name in rows.units if name != TIME_COLUMN and not is_added_column(name)]
 
 
 def compute_spectrograms(
