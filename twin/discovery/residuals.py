@@ -62,8 +62,8 @@ MIN_CHANGES = 8  # values of a step that show the noise
 CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
-# Power of the forces of a row over its noise, up to the highest frequency of its facts: with less,
-# noise of the motion would shift its slopes by a larger share than the inverse.
+# Power of a bumper's force over the noise of its row, up to the highest frequency of its facts:
+# with less, noise of the motion would shift its slopes by a larger share than the inverse.
 MIN_FACT_RATIO = 16.0
 MAX_SAMPLES = 120_000  # moving samples of all logs together; limits time and memory
 
@@ -148,7 +148,7 @@ class LogResiduals:
     fixed_mask: Bool2D | None = None
     # Mean square of the entries of each row, by name, of noise and unknown errors alone.
     expected_squares: Mapping[str, float] = field(default_factory=dict)
-    # Highest frequency of the facts of each force row in Hz, by name.
+    # Highest frequency of the facts of the bumpers' rows in Hz, by name.
     row_bands: Mapping[str, float] = field(default_factory=dict)
     is_sampled: bool = False  # entries are samples, for maps and subsets, in place of facts
     motion_cache: list[tuple[tuple[SensorModel, ...], MeasuredMotion]] = field(default_factory=list)
@@ -351,9 +351,10 @@ class LogResiduals:
         learned = self.with_learned_noise(parameters)
         measured = learned.measured_entries * learned.entry_weight
         bands = {}
-        for row, name in enumerate(FORCE_ROWS):
+        for name in CONTACT_ROWS:
+            row = FORCE_ROWS.index(name)
             basis = self.bases[row]
-            if name not in CONTACT_ROWS or basis is None or not basis.size:
+            if basis is None or not basis.size:
                 continue
             number = number_bands(basis.frequency_hz)
             squares = measured[learned.entry_row == row] ** 2
