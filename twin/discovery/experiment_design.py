@@ -379,12 +379,11 @@ def make_residuals(
     those of the last recording.
     """
     last = problem.log_residuals[-1]
-    readings = _add_noise(truth, last.signals)
+    readings = _add_noise(truth, last.signals.with_louder_channels(last.noise_scale))
     number = last.log_number + 1
     signals = build_signals((readings,), motion.name, motion.mass_kg, motion.gaps_m)
     residuals = LogResiduals(
         number, signals, last.contact_n, last.reference, last.scale, last.weights, last.thinning,
-        noise_scale=last.noise_scale,
     )  # fmt: skip
     if last.nuisances is None:
         return residuals

@@ -764,7 +764,7 @@ class LogResiduals:
     def _measure_change(self, row: int, r: Float1D) -> Float1D:
         """Return the mean square over the noise that a row does not repeat, (band,); 1 if unknown.
 
-        Bands with too few components are as the nearest ones.
+        Bands with too few components have the value of the whole row.
         A motion that changes from cycle to cycle changes what a missing law leaves, by as large a
         share as the force, or `CHANGE_ORDER` times that for a law of so high an order.
         """
@@ -773,7 +773,7 @@ class LogResiduals:
             return np.ones(BAND_COUNT)
         sample, m = self.entry_sample[facts], self.motion()
         measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
-        variances: dict[int, list[float]] = {}
+        variances: dict[int | None, list[float]] = {}  # of the steps, by band; None: of all bands
         force = self.measured_entries[facts] * self.entry_weight[facts]
         for number in np.unique(m.step[sample][measured]):
             chosen = measured & (m.step[sample] == number)
@@ -788,19 +788,17 @@ class LogResiduals:
             share = changed_force / max(float(np.nanmean(table[1] ** 2)), 1e-300)
             bands = np.zeros(table.shape[2], dtype=np.int64)
             bands[order] = number_bands(basis.frequency_hz[chosen])
-            for band in np.unique(bands[order]):
-                own = changes[0][:, bands == band]
-                if np.isfinite(own).sum() >= MIN_CHANGES:
-                    square = float(np.nanmean(table[0][:, bands == band] ** 2))
-                    change = 0.5 * float(np.nanmean(own**2))
-                    variances.setdefault(int(band), []).append(
-                        change - CHANGE_ORDER**2 * share * square
-                    )
-        if not variances:
-            return np.ones(BAND_COUNT)
-        known = sorted(variances)
-        medians = [float(np.median(variances[band])) for band in known]
-        return np.interp(np.arange(BAND_COUNT), known, medians)
+            for band in (None, *np.unique(bands[order]).tolist()):
+                own = np.ones(bands.size, dtype=bool) if band is None else bands == band
+                change = changes[0][:, own]
+                if np.isfinite(change).sum() >= MIN_CHANGES:
+                    square = float(np.nanmean(table[0][:, own] ** 2))
+                    unsteady = CHANGE_ORDER**2 * share * square
+                    value = 0.5 * float(np.nanmean(change**2)) - unsteady
+                    variances.setdefault(band, []).append(value)
+        medians = {band: float(np.median(values)) for band, values in variances.items()}
+        whole = medians.pop(None, 1.0)
+        return np.array([medians.get(band, whole) for band in range(BAND_COUNT)])
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
