@@ -35,6 +35,7 @@ EXPRESSIONS = {
     "note = 'it''s B2' and stiffness < 36100": ["run1"],
     "temperature_c > 0": [],  # unknown, which meets nothing
 }
+SQL = {"gap_mm = 10 or twin_misfit > 4.5": ["run2", "run1"], "len(tags) = 1": ["run1"]}
 
 
 def state_run(number: int) -> dict[str, Any]:
@@ -147,7 +148,7 @@ def test_runs_and_single_logs_are_the_same_with_and_without_a_catalogue(archive:
     update_catalog([archive])
     assert list_names(index_runs(archive)) == names
     assert find_run_folders(archive) == [archive / row.folder for row in rows[:-1]]
-    (archive / "catalog/runs.parquet").write_bytes(b"PAR1 and no more")
+    (archive / "catalog/runs.ndjson").write_bytes(b'{"root": ".", "fol')
     assert list_names(index_runs(archive, "gap_mm = 10")) == ["run2", "imported.mcap"]
 
 
@@ -204,6 +205,13 @@ def test_expressions_select_the_same_runs_with_and_without_duckdb(
     assert names == {"run1", "run3"} & set(EXPRESSIONS[expression])
 
 
+@pytest.mark.parametrize("expression", SQL)
+def test_other_expressions_are_selected_by_duckdb(archive: Path, expression: str) -> None:
+    pytest.importorskip("duckdb")
+    update_catalog([archive])
+    assert list_names(index_runs(archive, expression)) == SQL[expression]
+
+
 def test_runs_that_changed_since_the_catalogue_are_selected_as_they_are(archive: Path) -> None:
     pytest.importorskip("duckdb")
     update_catalog([archive])
@@ -216,6 +224,7 @@ def test_runs_that_changed_since_the_catalogue_are_selected_as_they_are(archive:
 @pytest.mark.parametrize(
     ("expression", "key"),
     [("gapmm = 4", "gapmm"), ("gap_mm = 'four'", "gap_mm"), ("test = 4", "test"),
+     ("tags < 'a'", "tags"),
      ("gap_mm = 4 or gap_mm = 10", ""), ("gap_mm = 4 twin_misfit > 3", ""), ("", ""),
      ("gap_mm = 4 and", ""), ("read_text('/etc/passwd') = 'x'", "")],
 )  # fmt: skip

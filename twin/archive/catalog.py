@@ -1,6 +1,7 @@
 """The catalogue of an archive: a row a run in runs.parquet, a row a step in steps.parquet.
 
-A run is read when it is new, or when the size or the time of one of its files changed; its hashes
+runs.ndjson holds the rows of runs.parquet: what is asked most needs no DuckDB, slow to import. A
+run is read when it is new, or when the size or the time of one of its files changed; its hashes
 then decide whether its rows are made again.
 """
 
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
     from duckdb import DuckDBPyConnection, DuckDBPyRelation  # of the extra `archive`
 
 CATALOG_FOLDER = "catalog"
-RUNS_FILE, STEPS_FILE = "runs.parquet", "steps.parquet"
+ROWS_FILE, RUNS_FILE, STEPS_FILE = "runs.ndjson", "runs.parquet", "steps.parquet"
 EXTRA = "archive"
 LAYOUT = "2"  # of the rows: a catalogue with another one is made anew
 KEY_TYPES = {"root": "VARCHAR", "folder": "VARCHAR"}
@@ -55,7 +56,6 @@ class _Refreshed:
 
     rows: dict[Key, Row] = field(default_factory=dict)
     steps: dict[Key, list[Row]] = field(default_factory=dict)
-    is_changed: bool = False
 
 
 def update_catalog(
@@ -83,15 +83,15 @@ def update_catalog(
         raise InputError("holds no catalogue", where=folder, remedy="name a new folder by --out")
     folder.mkdir(parents=True, exist_ok=True)
     with open_database() as database:
-        before = {} if is_new else _read_rows(database, folder)
+        before = _read_rows(folder) if (folder / ROWS_FILE).is_file() else {}
         names = [os.path.relpath(root.resolve(), folder.resolve()) for root in roots]
         refreshed = _refresh(folder, names, before, tell)
         rows = _sort_newest_first(refreshed.rows.values())
         kept = before.keys() & (refreshed.rows.keys() - refreshed.steps.keys())
         step_count = _write_steps(database, folder / STEPS_FILE, kept, refreshed)
-        with TemporaryDirectory() as scratch:
-            relation = make_relation(database, rows, COLUMN_TYPES, Path(scratch))
-            _write_parquet(relation, folder / RUNS_FILE)
+        fresh = folder / f"{ROWS_FILE}.new"
+        _write_parquet(make_relation(database, rows, COLUMN_TYPES, fresh), folder / RUNS_FILE)
+        fresh.replace(folder / ROWS_FILE)
     return Catalog(
         folder,
         tuple(map(RunRow.from_columns, rows)),
@@ -101,28 +101,28 @@ def update_catalog(
     )
 
 
-def load_rows(folder: Path, database: "DuckDBPyConnection | None") -> tuple[list[Row], Path | None]:
-    """Return the rows of the runs in a folder, newest first, and the Parquet file that holds them.
+def load_rows(folder: Path) -> list[Row]:
+    """Return the rows of the runs in a folder, the newest first.
 
-    From its catalogue, with what changed since, which is read but not written; the file is None
-    then. Without a catalogue, or with a damaged one, all runs in the folder are read.
+    From its catalogue, with what changed since, which is read but not written. Without a catalogue,
+    or with a damaged one, all runs in the folder are read.
     """
     catalog = next(
-        (c for c in (folder, folder / CATALOG_FOLDER) if (c / RUNS_FILE).is_file()), None
+        (c for c in (folder, folder / CATALOG_FOLDER) if (c / ROWS_FILE).is_file()), None
     )
-    if catalog is None or database is None:
-        return _sort_newest_first(_refresh(folder, ["."], None).rows.values()), None
-    try:
-        before = _read_rows(database, catalog)
-    except InputError as error:
-        error_console.print(f"warning: {error}", highlight=False, soft_wrap=True)
-        return load_rows(folder, None)
+    before = None
+    if catalog is not None:
+        try:
+            before = _read_rows(catalog)
+        except InputError as error:
+            error_console.print(f"warning: {error}", highlight=False, soft_wrap=True)
+    if catalog is None or before is None:
+        return _sort_newest_first(_refresh(folder, ["."], None).rows.values())
     roots = dict.fromkeys(root for root, _ in before) or {os.pardir: None}
-    refreshed = _refresh(catalog, list(roots), before)
-    rows = _sort_newest_first(refreshed.rows.values())
+    rows = _sort_newest_first(_refresh(catalog, list(roots), before).rows.values())
     for row in rows:
         row["folder"] = os.path.relpath(catalog / f"{row['root']}/{row['folder']}", folder)
-    return rows, None if refreshed.is_changed else catalog / RUNS_FILE
+    return rows
 
 
 def _read_run(
@@ -155,7 +155,7 @@ def _refresh(
 
     Without rows of a catalogue `before` no file is hashed.
     """
-    refreshed = _Refreshed(is_changed=False)
+    refreshed = _Refreshed()
     runs = {
         (root, os.path.relpath(run, catalog / root)): run
         for root in roots
@@ -170,10 +170,8 @@ def _refresh(
             row = replace(read, root=key[0], files=files).to_columns()
             if steps is not None:
                 refreshed.steps[key] = steps
-            refreshed.is_changed = True
             tell(number, len(runs))
         refreshed.rows[key] = row
-    refreshed.is_changed |= refreshed.rows.keys() != (before or {}).keys()
     return refreshed
 
 
@@ -200,32 +198,27 @@ def open_database() -> "DuckDBPyConnection":
     )
 
 
-def _read_rows(database: "DuckDBPyConnection", catalog: Path) -> dict[Key, Row]:
+def _read_rows(catalog: Path) -> dict[Key, Row]:
     """Return the rows of a catalogue by run; InputError if its file is damaged."""
-    import duckdb
-
-    path = catalog / RUNS_FILE
+    path = catalog / ROWS_FILE
     try:
-        cursor = database.execute("SELECT * FROM read_parquet(?)", [str(path)])
-        names = [column[0] for column in cursor.description]
-        rows = [dict(zip(names, values, strict=True)) for values in cursor.fetchall()]
+        rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         return {(row["root"], row["folder"]): row for row in rows}
-    except (duckdb.Error, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(
-            f"no catalogue of runs: {str(error).splitlines()[0]}",
+            f"no catalogue of runs: {error}",
             where=path,
             remedy="remove its folder and run `shaketwin catalog` again",
         ) from None
 
 
 def make_relation(
-    database: "DuckDBPyConnection", rows: Iterable[Row], types: Mapping[str, str], scratch: Path
+    database: "DuckDBPyConnection", rows: Iterable[Row], types: Mapping[str, str], path: Path
 ) -> "DuckDBPyRelation":
-    """Return rows as a relation of a database; columns without a type hold numbers.
+    """Write rows to a file of JSON lines, and return it as a relation of a database.
 
-    `scratch` is a folder that must exist as long as the relation.
+    Columns without a type hold numbers.
     """
-    path = scratch / f"{len(list(scratch.iterdir()))}.ndjson"
     names = dict.fromkeys(types)
     with path.open("w", encoding="utf-8") as file:
         for row in rows:
@@ -243,9 +236,10 @@ def _write_steps(
     keys: list[Row] = [{"root": root, "folder": folder} for root, folder in kept]
     with TemporaryDirectory() as folder:
         scratch = Path(folder)
-        steps = make_relation(database, rows, STEP_TYPES, scratch)
+        steps = make_relation(database, rows, STEP_TYPES, scratch / "steps.ndjson")
         if path.is_file():
-            make_relation(database, keys, KEY_TYPES, scratch).create_view("kept")
+            kept_runs = make_relation(database, keys, KEY_TYPES, scratch / "kept.ndjson")
+            kept_runs.create_view("kept")
             database.read_parquet(str(path)).create_view("old")
             steps.create_view("fresh")
             steps = database.sql(

@@ -1,7 +1,7 @@
 """Selection of runs by an expression over the columns of the catalogue, as of SQL after WHERE.
 
-With DuckDB it may be any expression. Without it, comparisons of a column with a number or a text in
-single quotes, and `'TAG' in tags`, joined by `and`.
+Comparisons of a column with a number or a text in single quotes, and `'TAG' in tags`, joined by
+`and`; with DuckDB any expression.
 """
 
 import operator
@@ -10,14 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from table_io.errors import InputError, format_pip_line, suggest
-from twin.archive.catalog import EXTRA, load_rows, make_relation, open_database
-from twin.archive.run_row import COLUMN_TYPES, Row, RunRow
-
-if TYPE_CHECKING:
-    from duckdb import DuckDBPyConnection  # of the extra `archive`
+from twin.archive.catalog import EXTRA, ROWS_FILE, load_rows, make_relation, open_database
+from twin.archive.run_row import COLUMN_TYPES, LIST_TYPE, Row, RunRow
 
 OPTION = "--where"
 OPERATORS: dict[str, Callable[[Any, Any], bool]] = {
@@ -43,29 +40,24 @@ def index_runs(folder: str | Path, where: str | None = None) -> list[RunRow]:
     folder = Path(folder)
     if not folder.is_dir():
         raise InputError("no such folder", where=folder, remedy="give a folder that holds runs")
-    if find_spec("duckdb") is None:
-        rows, _ = load_rows(folder, None)
-        if where is not None:
+    rows = load_rows(folder)
+    if where is not None:
+        try:
             rows = select_by_comparisons(rows, where)
-        return [*map(RunRow.from_columns, rows)]
-    with open_database() as database:
-        rows, path = load_rows(folder, database)
-        if where is not None:
-            rows = _select_rows(database, rows, path, where)
+        except InputError:
+            if find_spec("duckdb") is None:
+                raise
+            rows = _select_rows(rows, where)  # importing DuckDB takes as long as the rest
     return [*map(RunRow.from_columns, rows)]
 
 
-def _select_rows(
-    database: "DuckDBPyConnection", rows: Sequence[Row], path: Path | None, where: str
-) -> list[Row]:
-    """Return the rows that meet an SQL expression; `path` is a Parquet file that holds them."""
+def _select_rows(rows: Sequence[Row], where: str) -> list[Row]:
+    """Return the rows that meet an SQL expression."""
     import duckdb
 
+    database = open_database()
     with TemporaryDirectory() as scratch:
-        if path is None:
-            relation = make_relation(database, rows, COLUMN_TYPES, Path(scratch))
-        else:
-            relation = database.read_parquet(str(path))
+        relation = make_relation(database, rows, COLUMN_TYPES, Path(scratch, ROWS_FILE))
         relation.to_table("runs")
     database.execute("SET enable_external_access = false")  # the expression reads no other file
     try:
@@ -125,6 +117,8 @@ def _make_condition(match: re.Match[str], columns: Iterable[str]) -> Callable[[R
     is_text = COLUMN_TYPES.get(key) == "VARCHAR"
     if key not in columns:
         raise InputError("no such column", where=OPTION, key=key, remedy=suggest(key, columns))
+    if COLUMN_TYPES.get(key) == LIST_TYPE:
+        raise InputError("is a list", where=OPTION, key=key, remedy="ask for 'TAG' in it")
     if is_text != (match["text"] is not None):
         kind = "a text: put it in single quotes" if is_text else "a number"
         raise InputError(f"is compared with {kind}", where=OPTION, key=key, value=match[0].strip())

@@ -96,14 +96,14 @@ NAMES = tuple(field.name for field in fields(RunRow) if field.name != "values")
 # Columns under a second name, as expressions are written.
 ALIASES = {"twin_misfit": "misfit", "twin_misfit_worst": "misfit_worst"}
 # Types of the columns in SQL; those that are not named hold numbers.
-NUMBER_TYPE = "DOUBLE"
+NUMBER_TYPE, LIST_TYPE = "DOUBLE", "VARCHAR[]"
 SQL_TYPES = {str: "VARCHAR", int: "BIGINT"}
 COLUMN_TYPES = {
     field.name: sql
     for field in fields(RunRow)
     for kind, sql in SQL_TYPES.items()
     if kind in (get_args(field.type) or (field.type,))
-} | {"tags": "VARCHAR[]"}
+} | {"tags": LIST_TYPE}
 STEP_TYPES = {
     "root": "VARCHAR", "folder": "VARCHAR", "run": "VARCHAR", "step": "BIGINT",
     "direction": "VARCHAR", "same_branch": "BOOLEAN",
