@@ -69,6 +69,22 @@ class LoopCheckData:
         return np.array([hold.f0 for hold in self.holds])
 
     @cached_property
+    def levels_m_s2(self) -> Float1D:
+        """Commanded peak acceleration of each held motion, (hold,)."""
+        return np.array([hold.level0 * hold.correction0 for hold in self.holds])
+
+    @cached_property
+    def expected_tones(self) -> Complex1D | None:
+        """Tone of the table at each held motion that the test relies on, (hold,); None if unknown.
+
+        The twin of the table foretells it with the drive of a history, at the level of the check.
+        """
+        response = self.profile.plan.response
+        if response is None:
+            return None
+        return response.find_tones(self.frequencies_hz, self.levels_m_s2)
+
+    @cached_property
     def rest_before(self) -> Block:
         """Samples at rest before the motion."""
         return self.block.cut(self.block.index, self._motion_span[0])
@@ -234,10 +250,9 @@ class LoopCheckData:
 
     def _tone_scale(self, name: str, hold: Segment) -> float:
         """Return the factor from an amplitude of the channel to its tone."""
-        level = hold.level0 * hold.correction0
         return (
             -((2 * math.pi * hold.f0) ** 2) if self.rig.channel_by_name[name].unit == "m" else 1.0
-        ) / level
+        ) / (hold.level0 * hold.correction0)
 
     def noise(self, name: str) -> float:
         """Return the rms of a channel at rest about its mean, SI; at least its rounding noise."""

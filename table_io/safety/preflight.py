@@ -254,9 +254,9 @@ def check_limits(
 def check_drive_rig(profile: Profile, rig: RigConfig, source: str) -> None:
     """Raise an InputError if the drive of a history was computed for another rig."""
     excitation = profile.excitation
-    if not isinstance(excitation, History) or excitation.drive_provenance is None:
+    if not isinstance(excitation, History) or excitation.drive_header is None:
         return
-    rigs = [made_for.name for made_for in excitation.drive_provenance.rigs]
+    rigs = [made_for.name for made_for in excitation.drive_header.provenance.rigs]
     if rigs and rig.name not in rigs:
         raise InputError(
             f"{excitation.drive} is a drive for rig {rigs[0]!r}, the test is for rig {rig.name!r}; "
@@ -274,9 +274,10 @@ def _list_drive_changes(profile: Profile, rig: RigConfig) -> list[str]:
     excitation = profile.excitation
     if not isinstance(excitation, History) or excitation.drive is None:
         return []
-    made_for, drive = excitation.drive_provenance, f"the drive {excitation.drive}"
-    if made_for is None or not made_for.rigs:
+    header, drive = excitation.drive_header, f"the drive {excitation.drive}"
+    if header is None or not header.provenance.rigs:
         return [f"{drive} does not say which rig it was computed for; {DRIVE_REMEDY}"]
+    made_for = header.provenance
     gap_mm = 1e3 * sum(profile.specimen.gaps_m)
     return [
         *made_for.list_rig_changes(rig, drive),

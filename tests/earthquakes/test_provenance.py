@@ -76,8 +76,8 @@ def test_a_drive_is_for_the_rig_of_its_twin_by_default(drive: DriveResult, tmp_p
     assert read_run_config(written).rig.name == "hydraulic"
     excitation = load_profile(written)[0].excitation
     assert isinstance(excitation, History)
-    made_for = excitation.drive_provenance
-    assert made_for is not None
+    assert excitation.drive_header is not None
+    made_for = excitation.drive_header.provenance
     assert made_for == drive.provenance
     assert made_for.rigs == (HashedFile.of_rig(parse_rig()),)
     assert (made_for.masses_kg, made_for.gaps_mm) == ((550.0,), (8.0,))

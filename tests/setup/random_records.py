@@ -17,7 +17,7 @@ import numpy as np
 
 from table_io.block import Block, Float1D
 from table_io.config.excitation import add_drive_margin
-from table_io.config.excitation.drive_file import format_drive
+from table_io.config.excitation.drive_file import DriveHeader, format_drive
 from table_io.config.provenance import Provenance
 from table_io.errors import InputError
 from table_io.records import RunStop, Trip
@@ -132,7 +132,7 @@ def write_wrong_drive(path: Path, rng: np.random.Generator) -> None:
     edge = np.clip(np.arange(target.size) / 500.0, 0.0, 1.0)
     window = np.minimum(edge, edge[::-1])
     (path.parent / "drive.csv").write_text(
-        format_drive(wrong * window, target, "a wrong drive", Provenance())
+        format_drive(wrong * window, target, "a wrong drive", DriveHeader(provenance=Provenance()))
     )
     path.write_text(
         path.read_text().replace("[excitation]\n", '[excitation]\ndrive = "drive.csv"\n')

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from table_io.config.excitation.drive_file import format_drive, parse_drive
+from table_io.config.excitation.drive_file import DriveHeader, format_drive, parse_drive
 from table_io.config.provenance import Provenance, seal_text
 from table_io.errors import InputError
 from tests.cli.test_hostile_toml import OWN
@@ -63,7 +63,9 @@ def write_artefacts(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Hash
     config = read_run_config(folder / "short.toml")
     play_unpaced(config, "run", folder / "run.mcap", lambda: None, lambda _: None)
     provenance = Provenance(code="0.2.0", levels_m_s2=(0.5,))
-    drive = format_drive(1.02 * TARGET_M, TARGET_M, "drive of a test", provenance)
+    drive = format_drive(
+        1.02 * TARGET_M, TARGET_M, "drive of a test", DriveHeader(provenance=provenance)
+    )
     (folder / "drive.csv").write_text(drive)
     (folder / "twin.toml").write_text(seal_text(OWN["twins"]))
     return {

@@ -14,8 +14,15 @@ import numpy as np
 import numpy.typing as npt
 from scipy.fft import next_fast_len
 
-from table_io.block import Float1D
+from table_io.block import Block, Float1D
+from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.excitation.waveform import smoothstep
+from table_io.config.profile import Profile
+from table_io.config.rig import RigConfig
+from table_io.safety.loop_check import unwrap_phase
+from table_io.safety.loop_check_data import LoopCheckData
+from table_io.sequencer.procedure import start_test
+from table_io.sequencer.state import TestPlan
 from twin.earthquakes.table_response import CROSSOVER_HZ, PredictiveModel
 
 BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
@@ -23,6 +30,7 @@ MAX_AMPLIFICATION = 5.0  # of the inverse
 MAX_ROUNDS = 25
 LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
 SMOOTHING_HZ = 0.5  # of the ratio of what a run lacked to the noise
+CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
 PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its beginning
 
 
@@ -120,6 +128,30 @@ def correct_played_drive(
     ratio = np.convolve(np.abs(spectrum) ** 2 / noise, np.ones(width) / width, mode="same")
     known = np.fft.irfft(spectrum * np.clip(1.0 - 1.0 / ratio, 0.0, 1.0), lacking.size)
     return run.command_m + compute_correction(known, model, rate_hz, band_hz)
+
+
+def predict_loop_check(
+    model: PredictiveModel, profile: Profile, rig: RigConfig
+) -> ExpectedResponse | None:
+    """Return the response that a loop check is to measure, without the specimen; None without it.
+
+    The motions of the check are played on the table's twin, at their low level.
+    """
+    state = start_test(TestPlan(profile, rig, 0))
+    count, rate_hz = state.trajectory.end, state.trajectory.rate_hz
+    command = state.drive.command(0, count)
+    if not command.any():
+        return None
+    values = np.stack([command, *model.simulate(command, rate_hz)])
+    block = Block("meas", 0, rate_hz, CHANNELS, values, *state.drive.labels(0, count))
+    data = LoopCheckData(block, state.drive, profile, rig, {})
+    tones = data.tones("table_acc_m_s2")
+    return ExpectedResponse(
+        frequencies_hz=tuple(data.frequencies_hz.tolist()),
+        levels_m_s2=tuple(data.levels_m_s2.tolist()),
+        gain=tuple(np.abs(tones).tolist()),
+        phase_rad=tuple(unwrap_phase(tones, data.frequencies_hz).tolist()),
+    )
 
 
 def measure_error(

@@ -16,7 +16,7 @@ from table_io.config.base import (
     format_toml,
     load_config,
 )
-from table_io.config.excitation.drive_file import format_drive
+from table_io.config.excitation.drive_file import DriveHeader, ExpectedResponse, format_drive
 from table_io.config.profile import Profile
 from table_io.config.provenance import Provenance, require_seal, seal_text
 from table_io.errors import InputError, suggest
@@ -270,7 +270,7 @@ class DriveResult:
 
     `expected_error` is the rms error of the acceleration in the band that the twin expects, over
     the rms of the target; None of a drive that was corrected after a run. `rig` is the name or path
-    of the rig file, `notes` are warnings.
+    of the rig file, `response` what its loop check is to measure, `notes` are warnings.
     """
 
     config: RunConfig
@@ -282,6 +282,7 @@ class DriveResult:
     band_hz: tuple[float, float]
     expected_error: float | None
     provenance: Provenance
+    response: ExpectedResponse | None
     notes: tuple[str, ...]
 
     @property
@@ -291,7 +292,8 @@ class DriveResult:
     def format_drive(self) -> str:
         """Return the text of the drive's file."""
         comment = f"drive of {self.config.name} on {self.twin_title}"
-        return format_drive(self.command_m, self.target_m, comment, self.provenance)
+        header = DriveHeader(provenance=self.provenance, response=self.response)
+        return format_drive(self.command_m, self.target_m, comment, header)
 
     def save(self, folder: Path) -> Path:
         """Write the profile with its files and the drive to a folder; return the profile's path.

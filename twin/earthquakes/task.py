@@ -17,7 +17,13 @@ from table_io.config.provenance import HashedFile, Provenance
 from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
-from twin.earthquakes.drive_computation import PlayedDrive, compute_command, correct_played_drive
+from twin.earthquakes.drive_computation import (
+    CHANNELS,
+    PlayedDrive,
+    compute_command,
+    correct_played_drive,
+    predict_loop_check,
+)
 from twin.earthquakes.result import (
     DRIVE_LINE,
     HYDRAULIC,
@@ -57,7 +63,6 @@ from twin.setup.unpaced import generate_ideal_twin
 from twin.system.files import hash_file
 from twin.system.versions import read_installed_versions
 
-CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
 MASS_CHANNEL = "mass_acc_m_s2"
 NOISE_S = 0.4  # at the start, where the table rests
 REST_S = 0.5  # kept before and after the motion
@@ -247,6 +252,7 @@ class DriveComputation:
             self.band_hz,
             expected_error,
             provenance,
+            predict_loop_check(self.model, self.config.profile, self.config.rig),
             self.notes,
         )
 

@@ -18,9 +18,13 @@ from pydantic import Field
 
 from table_io.block import Float1D
 from table_io.config.base import ConfigModel, Count
-from table_io.config.excitation.drive_file import parse_drive, parse_drive_provenance
+from table_io.config.excitation.drive_file import (
+    DriveHeader,
+    ExpectedResponse,
+    parse_drive,
+    parse_drive_header,
+)
 from table_io.config.plugins import list_entry_points, load_entry, make_plugin_error
-from table_io.config.provenance import Provenance
 from table_io.errors import InputError, suggest
 from table_io.records import Step
 
@@ -40,7 +44,8 @@ class ExcitationPlan:
     played as it is, from rest to rest, open loop and without a phase, in `windows` equal parts;
     `target_m`, (sample,), is then the displacement that the table should have. A swept sine has
     neither, but the largest displacement of the table, `swept_disp_m`. The loop check takes its
-    motions from the peak table acceleration and the frequency band.
+    motions from the peak table acceleration and the frequency band; `response` is what it is to
+    measure, where the twin of the table says so.
     """
 
     level_m_s2: float
@@ -50,6 +55,7 @@ class ExcitationPlan:
     history_m: Float1D = field(default_factory=lambda: np.empty(0))
     target_m: Float1D = field(default_factory=lambda: np.empty(0))
     windows: int = 0
+    response: ExpectedResponse | None = None
     blend_cycles: float = MIN_BLEND_CYCLES
     swept_disp_m: float = 0.0
 
@@ -125,11 +131,11 @@ class History(Excitation):
         return self._add_margin(self._compute_history(rate_hz), rate_hz)
 
     @property
-    def drive_provenance(self) -> Provenance | None:
+    def drive_header(self) -> DriveHeader | None:
         """What the drive was computed for; None without a drive, or if it does not say."""
         if self.drive is None:
             return None
-        return parse_drive_provenance(self.files.get(self.drive, ""), self.drive)
+        return parse_drive_header(self.files.get(self.drive, ""), self.drive)
 
     def _compute_history(self, rate_hz: float) -> Float1D:
         return np.ascontiguousarray(self.displacement(rate_hz), dtype=np.float64)
@@ -162,8 +168,15 @@ class History(Excitation):
         command = target
         if self.drive is not None:
             command = parse_drive(self.files.get(self.drive, ""), self.drive, target)
+        header = self.drive_header
         return ExcitationPlan(
-            level, low_hz, high_hz, history_m=command, target_m=target, windows=self.windows
+            level,
+            low_hz,
+            high_hz,
+            history_m=command,
+            target_m=target,
+            windows=self.windows,
+            response=None if header is None else header.response,
         )
 
 

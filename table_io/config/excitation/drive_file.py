@@ -2,17 +2,18 @@
 
 Comments after #, a line `drive_mm`, then one value a line at the rate of the run. Two comments
 state the target, so that the drive of one level is not played for another: a specimen with
-clearance does not scale. The last comments are the drive's provenance in TOML, from its line
-[provenance] on.
+clearance does not scale. The last comments are TOML, from their line [provenance] on: what the
+drive was computed for, and the response of the table that it relies on.
 """
 
 import re
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
 from table_io.block import Float1D
-from table_io.config.base import ConfigModel, format_toml, parse_toml
+from table_io.config.base import ConfigModel, Finite, Positive, format_toml, parse_toml
 from table_io.config.provenance import Provenance, require_seal, seal_text
 from table_io.errors import InputError
 
@@ -22,23 +23,45 @@ DRIVE_REMEDY = "compute it anew with `shaketwin table-drive`"
 TARGET_PATTERN = re.compile(r"^# target_(peak|rms)_mm = (\S+)$", re.MULTILINE)
 MAX_TARGET_ERROR = 1e-3  # relative, of peak and rms
 MAX_REST_RATIO = 1e-3  # of the peak: largest command at the ends
-PROVENANCE_PATTERN = re.compile(r"^# \[provenance\]\n(#.*\n)*", re.MULTILINE)
+MAX_MOTION_DIFFERENCE = 0.01  # relative, of frequency and level of the motions of two loop checks
+HEADER_PATTERN = re.compile(r"^# \[provenance\]\n(#.*\n)*", re.MULTILINE)
 
 
-class _DriveHeader(ConfigModel):
+class ExpectedResponse(ConfigModel):
+    """Response of a table, acceleration over command, that a loop check is to measure, (motion,).
+
+    At the level of the check: friction holds a table back that follows at that of the test.
+    """
+
+    frequencies_hz: tuple[Positive, ...] = Field(description="Of the held motions.")
+    levels_m_s2: tuple[Positive, ...] = Field(description="Of their commands.")
+    gain: tuple[Positive, ...] = Field(description="Of the fundamental of the acceleration.")
+    phase_rad: tuple[Finite, ...] = Field(description="Negative where the table lags.")
+
+    def find_tones(
+        self, frequencies_hz: Float1D, levels_m_s2: Float1D
+    ) -> npt.NDArray[np.complex128] | None:
+        """Return gain and phase at held motions, complex (motion,); None of other motions."""
+        asked = np.log(np.array([frequencies_hz, levels_m_s2]))
+        known = np.log(np.array([self.frequencies_hz, self.levels_m_s2]))
+        if asked.shape != known.shape or np.abs(asked - known).max() > MAX_MOTION_DIFFERENCE:
+            return None
+        return np.array(self.gain) * np.exp(1j * np.array(self.phase_rad))
+
+
+class DriveHeader(ConfigModel):
     """TOML in the comments of a drive file."""
 
     provenance: Provenance = Field(description="What the drive was computed for and from.")
+    response: ExpectedResponse | None = Field(None, description="By the twin of the table.")
 
 
-def format_drive(
-    command_m: Float1D, target_m: Float1D, comment: str, provenance: Provenance
-) -> str:
+def format_drive(command_m: Float1D, target_m: Float1D, comment: str, header: DriveHeader) -> str:
     """Return the text of a drive file: command and target in m, (sample,) each."""
     lines = [f"# {' '.join(comment.splitlines())}"]
     lines += [f"# target_{name}_mm = {1e3 * size:.9g}" for name, size in _measure(target_m).items()]
-    header = format_toml({"provenance": provenance.model_dump()})
-    lines += [f"# {line}" for line in header.splitlines() if line]
+    toml = format_toml(header.model_dump(exclude_none=True))
+    lines += [f"# {line}" for line in toml.splitlines() if line]
     return seal_text("\n".join([*lines, HEADER, *(f"{1e3 * value:.6f}" for value in command_m)]))
 
 
@@ -90,13 +113,13 @@ def parse_drive(text: str, name: str, target_m: Float1D) -> Float1D:
     return command
 
 
-def parse_drive_provenance(text: str, name: str) -> Provenance | None:
+def parse_drive_header(text: str, name: str) -> DriveHeader | None:
     """Return what a drive file was computed for; None if it does not say. InputError if faulty."""
-    header = PROVENANCE_PATTERN.search(text)
+    header = HEADER_PATTERN.search(text)
     if header is None:
         return None
     toml = "\n".join(line.removeprefix("#") for line in header[0].splitlines())
-    return parse_toml(toml, _DriveHeader, name).provenance
+    return parse_toml(toml, DriveHeader, name)
 
 
 def _measure(target_m: Float1D) -> dict[str, float]:

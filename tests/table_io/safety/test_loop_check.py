@@ -17,6 +17,7 @@ from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.clock import ManualClock
 from table_io.config.calibration import command_to_volts, compute_tare, measure_noise, volts_to_si
+from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.order_tracking import evaluate_transfer
@@ -33,6 +34,7 @@ from table_io.safety.loop_check import (
     plan_targets,
     unwrap_phase,
 )
+from table_io.safety.loop_check_data import LoopCheckData
 from table_io.units import GRAVITY_M_S2
 from tests.builders.drives import sine_segments
 from tests.builders.profiles import list_shipped_sweeps, read_shipped_profile
@@ -415,6 +417,59 @@ def test_sensor_that_errs_at_one_frequency_leaves_the_smooth_curve() -> None:
         assert lines == {(line, "table_acc_m_s2"), (TABLE_TWICE, "table_disp_m")}
 
 
+def rely_on_measured_response(
+    name: str, gain_ratio: float = 1.0, extra_ms: float = 0.0
+) -> CheckRun:
+    """Return a check whose drive relies on the measured response but for an error at 2nd motion."""
+    profile, block, drive, noise = record_loop_check(name)
+    data = LoopCheckData(block, drive, profile, RIG, noise)
+    hz, tones = data.frequencies_hz, data.tones("table_acc_m_s2")
+    error = np.where(np.arange(hz.size) == 1, 1.0, 0.0)
+    response = ExpectedResponse(
+        frequencies_hz=tuple(hz),
+        levels_m_s2=tuple(data.levels_m_s2),
+        gain=tuple(np.abs(tones) * gain_ratio**error),
+        phase_rad=tuple(np.angle(tones) - 2e-3 * math.pi * hz * extra_ms * error),
+    )
+    relying = profile.model_copy()
+    relying.__dict__["plan"] = replace(profile.plan, response=response)
+    return relying, block, drive, noise
+
+
+def test_resonance_that_the_drive_relies_on_is_no_fault() -> None:
+    """Both sensors of the table see it; without a drive the response is interpolated there."""
+    recorded = record_loop_check("gm10")
+    held = [part for part in sine_segments(recorded[2]) if part.label == Label.CHECK][1]
+
+    def amplify(values: Float1D) -> Float1D:
+        values[held.start : held.end] *= 1.3
+        return values
+
+    resonance = {"table_acc_m_s2": amplify, "table_disp_m": amplify}
+    assert {name for name, _ in list_failures("gm10", resonance)} == {"gain off a smooth curve"}
+    relying = rely_on_measured_response("gm10", gain_ratio=1.3)
+    assert list_failures(relying, resonance) == set()
+    assert {name for name, _ in list_failures(relying)} == {"gain off that of the drive"}
+
+
+def test_table_that_lags_more_than_its_drive_relies_on_fails() -> None:
+    late = "delay off that of the drive, over the frequencies"
+    failures = list_failures(rely_on_measured_response("gm10", extra_ms=-30.0))
+    assert failures == {(late, "table_acc_m_s2"), (late, "table_disp_m")}
+
+
+def test_drive_of_another_loop_check_leaves_the_smooth_curve() -> None:
+    profile, *others = rely_on_measured_response("gm10", gain_ratio=2.0)
+    response = profile.plan.response
+    assert response is not None
+    levels = tuple(2.0 * level for level in response.levels_m_s2)
+    other = profile.model_copy()
+    other.__dict__["plan"] = replace(
+        profile.plan, response=response.model_copy(update={"levels_m_s2": levels})
+    )
+    assert list_failures((other, *others)) == set()
+
+
 def test_noise_at_the_tare_counts_too() -> None:
     profile, block, drive, noise = record_loop_check("g4_ss3")
     noisy = (profile, block, drive, noise | {"mass_acc_m_s2": 0.05})
@@ -456,6 +511,7 @@ def test_every_line_that_can_fail_has_a_remedy() -> None:
     profile, block, drive, noise = record_loop_check("gm1")
     preload_n = ((0.0, 500.0), (0.0, 500.0))
     checks |= set(evaluate(block, drive, profile, RIG, noise, preload_n)[0])
+    checks |= set(evaluate_checks(rely_on_measured_response("gm10")))
     for check in checks:
         limited = math.isfinite(check.low) or math.isfinite(check.high)
         assert bool(find_remedy(check)) == limited, check.name

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from table_io.config.excitation import History, add_drive_margin
-from table_io.config.excitation.drive_file import format_drive
+from table_io.config.excitation.drive_file import DriveHeader, format_drive
 from table_io.config.profile import load_profile
 from table_io.config.provenance import Provenance
 from table_io.records import Trip
@@ -46,7 +46,7 @@ def test_a_table_far_off_the_target_of_its_drive_trips(
     excitation = load_profile(path)[0].excitation
     assert isinstance(excitation, History)
     target = add_drive_margin(excitation.displacement(1000.0), 1000.0)
-    drive = format_drive(factor * target, target, "drive", Provenance())
+    drive = format_drive(factor * target, target, "drive", DriveHeader(provenance=Provenance()))
     (tmp_path / "drive.csv").write_text(drive)
     path.write_text(RECORD)
     rig = change_rig(table_response={"least_level_g": least_level_g})
