@@ -19,7 +19,7 @@ exponential by less than 1e-9, and where a rate is 0 the frequency comes smoothl
 """
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -479,10 +479,10 @@ class Drive:
         last = first + count
         overlaps: list[tuple[Segment | HistorySegment, slice, Float1D]] = []
         first_segment = max(bisect_right(self._starts, first) - 1, 0)
-        for segment in self.segments[first_segment:]:
-            if segment.start >= last:
-                break
-            lo, hi = max(first, segment.start), min(last, segment.end)
+        for number in range(first_segment, bisect_left(self._starts, last)):
+            segment = self.segments[number]
+            end = min([segment.end, *self._starts[number + 1 : number + 2]])
+            lo, hi = max(first, segment.start), min(last, end)
             if lo < hi:
                 x = (np.arange(lo, hi) - segment.start) / segment.count
                 overlaps.append((segment, slice(lo - first, hi - first), x))

@@ -181,10 +181,10 @@ def test_decay_of_a_history_is_the_shortest_that_bounds_its_acceleration(
 
 
 def make_drive() -> Drive:
-    """A blend from rest, a hold that a later blend cuts short, a gap, and a history."""
+    """A blend from rest, a hold that outlasts the blends that cut it, a gap, and a history."""
     segments = (
         Segment(100, 50, Label.BLEND, 0, 40.0, 40.0, 0.0, 5.0, 0.0),
-        Segment(150, 200, Label.MEASURE, 0, 40.0, 40.0, 5.0, 5.0, 0.2, 8, 3),
+        Segment(150, 350, Label.MEASURE, 0, 40.0, 40.0, 5.0, 5.0, 0.2, 14, 3),
         Segment(300, 60, Label.BLEND, 1, 40.0, 25.0, 5.0, 4.0, 0.7),
         Segment(360, 80, Label.BLEND, 1, 25.0, 25.0, 4.0, 0.0, 0.1),
         make_history(start=470),
@@ -193,7 +193,7 @@ def make_drive() -> Drive:
 
 
 @pytest.mark.parametrize("decay_start", [None, 99, 100, 130, 320, 445, 480, 900])
-def test_every_sample_is_that_of_the_latest_segment_that_contains_it(
+def test_every_sample_is_that_of_the_segment_that_began_last(
     decay_start: int | None,
 ) -> None:
     drive = replace(make_drive(), decay_start=decay_start)
@@ -208,7 +208,8 @@ def test_every_sample_is_that_of_the_latest_segment_that_contains_it(
         if decay_start is not None:
             share = (index - decay_start) / drive.decay_samples
             factor = 1.0 - quintic(min(max(share, 0.0), 1.0))
-        containing = [segment for segment in drive.segments if segment.start <= index < segment.end]
+        begun = [segment for segment in drive.segments if segment.start <= index]
+        containing = [segment for segment in begun[-1:] if index < segment.end]
         added = 1e-4 if 200 <= index < 290 else 0.0
         expected["command"][place] = added * factor
         if containing:
