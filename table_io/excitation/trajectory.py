@@ -5,6 +5,7 @@ A trajectory is immutable and independent of measurements; `sequencer` decides w
 """
 
 import math
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -25,6 +26,7 @@ from table_io.records import Step
 
 PEAK_RATIO = 1.05  # largest acceleration of a blend, over the larger level
 SETTLE_UPDATES = 8  # of the level of a swept sine, before its frequency moves
+UNCHANGED = sys.maxsize  # no sample of a drive that is queued changes
 NOMINAL_UPDATE_S = 1.0  # between updates that change nothing: fewer, longer segments
 
 
@@ -44,7 +46,10 @@ class SineTarget:
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Segments so far; `target` is the motion at sample `end`, where the next one begins."""
+    """Segments so far; `target` is the motion at sample `end`, where the next one begins.
+
+    Samples before `changed_from` are those of the drive that is queued.
+    """
 
     rate_hz: float
     end: int
@@ -52,12 +57,13 @@ class Trajectory:
     phase: float = 0.0  # in cycles, at `end`
     log_rate_1_s: float = 0.0  # slope of ln f at `end`, of a swept sine
     segments: tuple[Segment | HistorySegment, ...] = ()
+    changed_from: int = UNCHANGED
 
     def append_rest(self, count: int) -> "Trajectory":
         """Append `count` samples of rest; ValueError if the motion is not at rest."""
         if self.target.level_m_s2 != 0.0:
             raise ValueError(f"the trajectory moves at sample {self.end}; blend to rest first")
-        return replace(self, end=self.end + count)
+        return replace(self, end=self.end + count, changed_from=min(self.changed_from, self.end))
 
     def append_blend(
         self, target: SineTarget, step: int, min_cycles: float, label: Label
@@ -126,8 +132,9 @@ class Trajectory:
         segments = tuple(segment for segment in self.segments if segment.start < index)
         if not segments:
             return replace(
-                self, end=index, segments=(), phase=0.0, target=replace(self.target, level_m_s2=0)
-            )
+                self, end=index, segments=(), phase=0.0, target=replace(self.target, level_m_s2=0),
+                changed_from=min(self.changed_from, index),
+            )  # fmt: skip
         last = segments[-1]
         if isinstance(last, HistorySegment):
             raise ValueError(f"a history is played at sample {index}; it cannot be cut")
@@ -137,8 +144,9 @@ class Trajectory:
         phase = float(last.phase(x, self.rate_hz)[0]) % 1.0
         target = SineTarget(last.f1, last.level1, last.correction1, last.shape1)
         return replace(
-            self, end=index, target=target, phase=phase, log_rate_1_s=last.rate1, segments=segments
-        )
+            self, end=index, target=target, phase=phase, log_rate_1_s=last.rate1, segments=segments,
+            changed_from=min(self.changed_from, index),
+        )  # fmt: skip
 
     def to_drive(self, steps: tuple[Step, ...]) -> Drive:
         """Return the drive of the trajectory with a soft stop at its end."""
@@ -181,6 +189,7 @@ class Trajectory:
             phase=phase,
             log_rate_1_s=segment.rate1,
             segments=(*self.segments, segment),
+            changed_from=min(self.changed_from, self.end),
         )
 
 

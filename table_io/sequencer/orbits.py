@@ -162,7 +162,7 @@ def _approach(
     capture_cycles: held at the first of them. The periods of a point count from the last blend
     on, without a capture.
     """
-    search, config, changed = _search(state), _config(state), trajectory.end
+    search, config = _search(state), _config(state)
     target, position = search.target, search.target.position
     feedback, since = search.feedback, search.since
     for waypoint in (*waypoints, Waypoint(target.reference, target.frequency_hz, position)):
@@ -188,7 +188,6 @@ def _approach(
         drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
         stage=Stage("orbit", position, first, last, target.update),
         search=replace(search, feedback=feedback, since=since),
-        changed_from=changed,
     )
 
 
@@ -261,7 +260,6 @@ def apply_feedback(state: SequencerState, block: Block, earliest: int) -> Sequen
 
     An orbit that stays at the limit of the feedback is lost.
     """
-    changed = state.changed_from
     if state.stage.kind == "release":
         state = advance_releases(state, block)
     elif _search(state).releases is not None:  # the operator holds the test
@@ -275,14 +273,12 @@ def apply_feedback(state: SequencerState, block: Block, earliest: int) -> Sequen
         state,
         search=replace(search, feedback=feedback),
         drive=replace(drive, correction=correction),
-        changed_from=min(changed, first),
+        corrected_from=first,
     )
     cycles = feedback.saturated_samples * search.target.frequency_hz / drive.rate_hz
     is_held = state.stage.kind in ("orbit", "release")
     if cycles > MAX_SATURATED_CYCLES and search.is_captured and is_held:
-        due = state.changed_from  # of the correction, earlier than what follows the loss
-        state = retry_orbit(state, block.end, "the feedback stayed at its limit")
-        return replace(state, changed_from=min(state.changed_from, due))
+        return retry_orbit(state, block.end, "the feedback stayed at its limit")
     return state
 
 
@@ -384,9 +380,8 @@ def _begin_releases(state: SequencerState, point: OrbitPoint, motion: Float1D) -
     search, stage, trajectory = _search(state), state.stage, state.trajectory
     period = trajectory.rate_hz / point.frequency_hz
     last = stage.last + math.ceil(_config(state).multiplier_periods * period)
-    changed = trajectory.end
     trajectory = trajectory.append_hold(
-        last + state.plan.margin - changed, point.step, Label.SETTLE
+        last + state.plan.margin - trajectory.end, point.step, Label.SETTLE
     )
     series = ReleaseSeries(
         point,
@@ -402,7 +397,6 @@ def _begin_releases(state: SequencerState, point: OrbitPoint, motion: Float1D) -
         drive=replace(trajectory.to_drive(state.steps), correction=state.drive.correction),
         stage=Stage("release", point.step, stage.last, last),
         search=replace(search, releases=series),
-        changed_from=changed,
     )
 
 
@@ -512,7 +506,6 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
         )
     if is_last:
         return end_continuation(replace(state, search=search), trajectory)
-    changed = trajectory.end
     at_rest = replace(trajectory.target, level_m_s2=0.0)
     trajectory = trajectory.append_blend(at_rest, position, config.blend_cycles, Label.BLEND)
     trajectory = trajectory.append_rest(round(REST_S * trajectory.rate_hz))
@@ -520,8 +513,7 @@ def retry_orbit(state: SequencerState, index: int, reason: str) -> SequencerStat
     search = replace(search, target=target, periods=0, since=trajectory.end)
     measured = (Waypoint(m.reference, m.frequency_hz, m.position) for m in search.measured)
     waypoints = (*_list_leads(config.orbit_plan), *measured)
-    state = _approach(replace(state, search=search), trajectory, waypoints, CAPTURE_CYCLES)
-    return replace(state, changed_from=changed)
+    return _approach(replace(state, search=search), trajectory, waypoints, CAPTURE_CYCLES)
 
 
 def end_continuation(state: SequencerState, trajectory: Trajectory) -> SequencerState:
@@ -534,7 +526,6 @@ def end_continuation(state: SequencerState, trajectory: Trajectory) -> Sequencer
         drive=replace(drive, correction=state.drive.correction),
         stage=Stage("end"),
         search=replace(search, feedback=_release(search.feedback, trajectory.end, state)),
-        changed_from=trajectory.end,
     )
 
 

@@ -64,25 +64,19 @@ MAX_HOLD_S = 3600.0  # an operator's hold times out after this
 
 def begin_excitation(state: SequencerState) -> SequencerState:
     """Approach the first step, begin a swept sine, or play the displacement history to its end."""
-    profile, changed = state.plan.profile, state.trajectory.end
+    profile = state.plan.profile
     if state.steps:
         return approach_step(state, profile.first_step)
     if profile.swept_sine is not None:
         return begin_swept_sine(state)
     plan = profile.plan
     trajectory = state.trajectory.append_history(plan.history_m, plan.windows)
-    return replace(
-        state,
-        trajectory=trajectory,
-        drive=trajectory.to_drive(()),
-        stage=Stage("end"),
-        changed_from=changed,
-    )
+    return replace(state, trajectory=trajectory, drive=trajectory.to_drive(()), stage=Stage("end"))
 
 
 def approach_step(state: SequencerState, position: int) -> SequencerState:
     """Blend to the step at `position` and tune there; without control, measure it at once."""
-    profile, changed = state.plan.profile, state.trajectory.end
+    profile = state.plan.profile
     while True:
         step = state.steps[position]
         target = (
@@ -91,7 +85,7 @@ def approach_step(state: SequencerState, position: int) -> SequencerState:
         trajectory = state.trajectory.append_blend(
             target, step.index, profile.sweep.blend_cycles, Label.BLEND
         )
-        state = replace(state, trajectory=trajectory, changed_from=changed)
+        state = replace(state, trajectory=trajectory)
         if profile.control.enabled:
             return start_tuning(state, Stage("tune", position))
         state = measure_step(state, position)
@@ -227,16 +221,18 @@ def decide_tuning(state: SequencerState) -> SequencerState:
         return accept_level(replace(state, tuning=state.tuning.add_accepted(target)))
     blend_cycles = state.plan.profile.sweep.blend_cycles
     trajectory = state.trajectory.append_blend(new_target, level.step, blend_cycles, Label.BLEND)
-    state = replace(state, trajectory=trajectory, changed_from=state.trajectory.end)
-    return start_tuning(state, replace(stage, update=stage.update + 1, first_fit=first))
+    return start_tuning(
+        replace(state, trajectory=trajectory),
+        replace(stage, update=stage.update + 1, first_fit=first),
+    )
 
 
 def accept_level(state: SequencerState) -> SequencerState:
     """Measure the step at the accepted level, then approach the next step if it is known."""
-    position, changed = state.stage.step, state.trajectory.end
-    state = replace(measure_step(state, position), changed_from=changed)
+    position = state.stage.step
+    state = measure_step(state, position)
     if state.stage.kind == "end" and position + 1 < len(state.steps):
-        state = replace(approach_step(state, position + 1), changed_from=changed)
+        return approach_step(state, position + 1)
     return state
 
 
@@ -375,7 +371,7 @@ def start_test(plan: TestPlan) -> SequencerState:
     if not targets:
         initial = SequencerState(plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps)
         begin = begin_continuation if profile.continuation is not None else begin_excitation
-        return replace(begin(initial), changed_from=0)
+        return begin(initial)
     for target in targets:
         trajectory = trajectory.append_blend(target, -1, blend_cycles, Label.BLEND)
         cycles = loop_check.count_hold_cycles(target, profile)
@@ -398,12 +394,9 @@ def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, t
 
 def decide_block(state: SequencerState, block: Block) -> SequencerState:
     """Return the state after the decisions that a measured block makes due, without feedback."""
-    drive = state.drive
-    state = replace(state, blocks=(*state.blocks, block), records=())
+    state = replace(state.mark_queued(), blocks=(*state.blocks, block), records=())
     while state.stage.kind in DECISION_FUNCTIONS and state.stage.last <= block.end:
         state = DECISION_FUNCTIONS[state.stage.kind](state)
-    if state.search is not None and state.drive is drive:
-        state = replace(state, changed_from=state.drive.planned_end)
     return state
 
 
@@ -425,21 +418,22 @@ def hold_test(state: SequencerState, index: int) -> SequencerState:
     """Hold the step that contains sample `index`; return the state unchanged without one."""
     if not state.steps or state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
         return state
-    trajectory = state.trajectory.cut(index)
+    trajectory = state.mark_queued().trajectory.cut(index)
     last = trajectory.segments[-1] if trajectory.segments else None
     if trajectory.end < index or not isinstance(last, Segment) or last.step < 0:
         return state  # the drive is already ending, or the sweep has not begun
-    return hold_step(replace(state, trajectory=trajectory, changed_from=trajectory.end), last.step)
+    return hold_step(replace(state.mark_queued(), trajectory=trajectory), last.step)
 
 
 def resume_test(state: SequencerState, index: int) -> SequencerState:
     """Resume from a hold: tune and measure the step again."""
     if state.stage.kind != "open":
         return state
+    state = state.mark_queued()
     state = replace(state, trajectory=state.trajectory.cut(index))
     if state.search is not None:
         return resume_continuation(state)
-    return replace(approach_step(state, state.stage.step), changed_from=index)
+    return approach_step(state, state.stage.step)
 
 
 def nominal_drive(plan: TestPlan) -> Drive:

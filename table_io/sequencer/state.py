@@ -1,7 +1,7 @@
 """State of the sequencer: test plan, drive so far, tuning and the next decision."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from table_io.adaptive.continuation import MeasuredOrbit, OrbitTarget
 from table_io.adaptive.policy import Policy
@@ -13,7 +13,7 @@ from table_io.control.amplitude_control import Tuning
 from table_io.control.orbit_feedback import FeedbackState
 from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
-from table_io.excitation.trajectory import SweptPosition, Trajectory
+from table_io.excitation.trajectory import UNCHANGED, SweptPosition, Trajectory
 from table_io.records import OrbitPoint, Record, Step, SweepLevel
 from table_io.safety.loop_check_data import PreloadLimits
 
@@ -106,7 +106,7 @@ class SweepSearch:
 
 @dataclass(frozen=True)
 class SequencerState:
-    """State of a running test; `drive` differs from the previous one from `changed_from` on."""
+    """State of a running test; its correction is that of the queue before `corrected_from`."""
 
     plan: TestPlan
     trajectory: Trajectory
@@ -114,7 +114,7 @@ class SequencerState:
     stage: Stage
     steps: tuple[Step, ...]
     tuning: Tuning = field(default_factory=Tuning)
-    changed_from: int = 0
+    corrected_from: int = UNCHANGED
     refusal: str = ""  # reason why the run must not continue
     noise: dict[str, float] | None = None  # rms of each channel at the tare, SI
     preload_n: PreloadLimits | None = None  # allowed force on the bumpers at rest
@@ -123,6 +123,16 @@ class SequencerState:
     search: OrbitSearch | None = None
     sweep: SweepSearch | None = None
     records: tuple[Record, ...] = field(default=())
+
+    @property
+    def changed_from(self) -> int:
+        """First sample in which `drive` differs from the one that is queued."""
+        return min(self.trajectory.changed_from, self.corrected_from)
+
+    def mark_queued(self) -> "SequencerState":
+        """Return the state of which `drive` is queued as it is."""
+        trajectory = replace(self.trajectory, changed_from=UNCHANGED)
+        return replace(self, trajectory=trajectory, corrected_from=UNCHANGED)
 
     @property
     def is_finished(self) -> bool:

@@ -72,24 +72,22 @@ def check_swept_channels(config: SweptSine, rig: RigConfig) -> None:
 
 def begin_swept_sine(state: SequencerState) -> SequencerState:
     """Start softly at the first frequency."""
-    config, changed = _config(state), state.trajectory.end
+    config = _config(state)
     gain = _known_gain(state, ())(math.log(config.ends_hz(0)[0]))
     trajectory, position = start_swept(state.trajectory, config, math.exp(-gain))
     sweep = SweepSearch(position, trajectory.end)
-    return replace(
-        _append_parts(replace(state, trajectory=trajectory, sweep=sweep)), changed_from=changed
-    )
+    return _append_parts(replace(state, trajectory=trajectory, sweep=sweep))
 
 
 def decide_sweep_level(state: SequencerState) -> SequencerState:
     """Measure the level over the last window, and append the next part of the test."""
-    changed, level = state.trajectory.end, _measure_level(state)
+    level = _measure_level(state)
     if level is not None:
         sweep, number = _sweep(state), _config(state).find_pass(level.step)
         passes = {**sweep.passes, number: (*sweep.passes.get(number, ()), level)}
         sweep = replace(sweep, passes=passes)
         state = replace(state, sweep=sweep, records=(*state.records, level))
-    return replace(_append_parts(state), changed_from=changed)
+    return _append_parts(state)
 
 
 def _config(state: SequencerState) -> SweptSine:

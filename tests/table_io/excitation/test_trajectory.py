@@ -9,7 +9,13 @@ import pytest
 
 from table_io.block import Label
 from table_io.excitation.drive import Drive, HistorySegment, Segment, peak_acceleration_ratio
-from table_io.excitation.trajectory import SineTarget, Trajectory, plan_sweep, start_trajectory
+from table_io.excitation.trajectory import (
+    UNCHANGED,
+    SineTarget,
+    Trajectory,
+    plan_sweep,
+    start_trajectory,
+)
 from table_io.records import Step
 from tests.builders.profiles import make_profile
 from tests.table_io.excitation.test_kinds import profile as make_example
@@ -83,7 +89,7 @@ def test_hold_keeps_its_target_and_advances_the_phase() -> None:
 
 
 def test_rest_and_histories_need_a_table_at_rest() -> None:
-    assert AT_REST.append_rest(50) == replace(AT_REST, end=350)
+    assert AT_REST.append_rest(50) == replace(AT_REST, end=350, changed_from=300)
     history_m = np.linspace(0.0, 1e-3, 40)
     played = AT_REST.append_history(history_m, 3)
     (segment,) = played.segments
@@ -189,3 +195,12 @@ def test_every_orbit_of_a_continuation_is_settled_and_measured() -> None:
     for segment in held:
         assert (segment.cycles, segment.settle) == (cycles, settle)
         assert -1e-9 <= segment.count - cycles / segment.f0 * profile.acquisition.rate_hz < 1.0
+
+
+def test_first_changed_sample_is_the_earliest_of_all_changes() -> None:
+    held = make_trajectory(SLOW).append_hold(400, 0, Label.MEASURE)
+    queued = replace(held, changed_from=UNCHANGED)
+    assert queued.append_hold(9, 0, Label.SETTLE).changed_from == 700
+    assert queued.cut(800).changed_from == 700
+    assert queued.cut(500).append_hold(40, 0, Label.SETTLE).cut(520).changed_from == 500
+    assert queued.cut(200).changed_from == 200
