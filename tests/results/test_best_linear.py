@@ -1,12 +1,19 @@
 """Best linear approximation of systems whose response, distortion and noise are known."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from table_io.config.excitation import history_acceleration
 from table_io.config.excitation.synthetic import PeriodicMultisine
+from tests.builders.profiles import read_shipped_profile
 from twin.results.best_linear import approximate
-from twin.results.contracts import BestLinearResult
+from twin.results.contracts import BestLinearResult, TrackingResult
+from twin.results.excitation_verdict import judge_excitation
+from twin.results.table_motion import TableMotion, check_lines, format_tracking
+from twin.results.tracking import judge_tracking
 
 RATE_HZ, NOISE = 200.0, 0.01
 EXCITATION = PeriodicMultisine(
@@ -73,3 +80,44 @@ def test_even_lines_and_one_of_four_odd_ones_are_left_out() -> None:
         )
     first, other = (history[start : start + PERIOD_SAMPLES] for start in starts[:2, 0])
     assert np.abs(np.corrcoef(first, other)[0, 1]) < 0.5
+
+
+def weigh_lines(gain: float = 1.0, lost: int = 0, quiet: int = 0) -> tuple[str, TrackingResult]:
+    """Return verdict and tracking of a table of a gain that loses samples, or some lines."""
+    disp_m = EXCITATION.displacement(RATE_HZ)
+    target = history_acceleration(disp_m, RATE_HZ)
+    achieved = gain * target
+    if quiet:
+        spectrum = np.fft.rfft(achieved)
+        hz = np.fft.rfftfreq(achieved.size, 1.0 / RATE_HZ)
+        spectrum[hz < (LINES[quiet] - 0.5) * RATE_HZ / PERIOD_SAMPLES] = 0.0
+        achieved = np.fft.irfft(spectrum, achieved.size)
+    achieved[3000 : 3000 + lost] = np.nan
+    motion = TableMotion(
+        RATE_HZ, 0, 0, target.size, disp_m, target, np.full(target.size, np.nan), achieved
+    )
+    profile = read_shipped_profile("multisine").model_copy(update={"excitation": EXCITATION})
+    error = judge_tracking(target, achieved, RATE_HZ, (0.5, 20.0))
+    tracking = TrackingResult(
+        **dict(error), from_s=0.0, to_s=1.0, required_spectrum=None,
+        lines=check_lines(motion, profile),
+    )  # fmt: skip
+    summary: Any = SimpleNamespace(run=SimpleNamespace(source="table"), tracking=tracking)
+    return judge_excitation(summary, profile).verdict, tracking
+
+
+def test_multisine_is_judged_by_the_level_of_its_lines() -> None:
+    """Not by its peak, which it has by chance: few lines that are off do not count."""
+    verdict, tracking = weigh_lines(gain=0.95)
+    assert tracking.lines is not None
+    assert (verdict, tracking.lines.outside, tracking.lines.count) == ("reached", 0, LINES.size)
+    assert tracking.lines.lowest_ratio == pytest.approx(0.95)
+    assert weigh_lines(quiet=2)[0] == "reached"
+    verdict, tracking = weigh_lines(quiet=20)
+    assert tracking.lines is not None
+    assert (verdict, tracking.lines.outside) == ("missed", 20)
+    assert tracking.lines.lowest_hz is not None
+    assert tracking.lines.lowest_hz < LINES[20] / 8.0
+    assert "PGA" not in format_tracking(tracking)
+    assert weigh_lines(gain=0.8)[0] == "missed"
+    assert weigh_lines(lost=5)[0] == "not judged"

@@ -320,17 +320,22 @@ class WindowResult(Contract):
     comparison: dict[str, ChannelError] = Field({}, description="errors of the twin by channel")
 
 
-class RequiredSpectrumResult(Contract):
-    """Test response spectrum (TRS) of the table against the required one (RRS), at 1/6 octave."""
+class SpectrumRatios(Contract):
+    """Spectrum of the table over that asked for: the amplitude of each line of a multisine."""
 
-    lower: Ratio = Field(description="least allowed TRS over RRS")
-    upper: Ratio = Field(description="largest allowed TRS over RRS; null without a limit")
-    count: int = Field(description="ordinates of the RRS that were checked")
-    outside: int | None = Field(description="ordinates outside; null if samples are lost")
-    lowest_ratio: Ratio = Field(description="smallest TRS over RRS")
+    lower: Ratio = Field(description="least allowed ratio")
+    upper: Ratio = Field(description="largest allowed ratio; null without a limit")
+    count: int = Field(description="frequencies that were checked")
+    outside: int | None = Field(description="ratios outside; null if samples are lost")
+    lowest_ratio: Ratio = Field(description="smallest ratio")
     lowest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
-    highest_ratio: Ratio = Field(description="largest TRS over RRS")
+    highest_ratio: Ratio = Field(description="largest ratio")
     highest_hz: Number = Field(description="its frequency", json_schema_extra={"unit": "Hz"})
+
+
+class RequiredSpectrumResult(SpectrumRatios):
+    """Test response spectrum (TRS) of the table over the required one (RRS), at 1/6 octave."""
+
     passed: bool = Field(description="whether every ordinate is allowed")
 
 
@@ -384,6 +389,9 @@ class TrackingResult(TrackingError):
     to_s: Seconds = Field(description="end of the part that was played")
     required_spectrum: RequiredSpectrumResult | None = Field(
         description="null without one in the profile"
+    )
+    lines: SpectrumRatios | None = Field(
+        None, description="of a random motion and a multisine, which have no peak to reach"
     )
 
 

@@ -4,7 +4,8 @@ A stepped sine is reached if the fundamental of the table acceleration is within
 `protection.alarm` of the demanded level at every step, a swept sine if it is for MIN_INSIDE of the
 time of all its passes; a record if its peak is within
 `tracking.required_lower` to `required_upper` of the target's, its rms error is small enough, and a
-required spectrum is met.
+required spectrum is met; a random motion or multisine, which has a spectrum and no peak to reach,
+if MIN_INSIDE of its lines are within `protection.alarm` of their level.
 """
 
 import math
@@ -14,16 +15,19 @@ from table_io.config.profile import Profile
 from twin.results.contracts import (
     ExcitationVerdict,
     RunSummary,
+    SpectrumRatios,
     StepEntry,
     SweptSineResult,
     TrackingResult,
     select_judged_points,
 )
+from twin.results.table_motion import format_lines
 
 # Of the rms of the target's acceleration, in the band that is judged: beyond it the table has
 # played another record, whatever its peak.
 MAX_RECORD_ERROR = 0.3
-MIN_INSIDE = 0.95  # of the time of a swept sine: the rest is for jumps of the specimen
+# Of the time of a swept sine, or the lines of a multisine: the rest is for jumps of the specimen.
+MIN_INSIDE = 0.95
 MAX_PEAK_EXCESS = 0.05  # of the table's peak over its fundamental: half of what harmonics of 8 % do
 MIN_DISTORTION = 0.03  # THD above which a raised peak is that of harmonics, not of noise
 
@@ -32,6 +36,8 @@ def judge_excitation(summary: RunSummary, profile: Profile) -> ExcitationVerdict
     """Return the verdict on the excitation of a run, from its other results."""
     if summary.run.source == "model":
         return _decline("no table was driven")
+    if summary.tracking and summary.tracking.lines is not None:
+        return _judge_lines(summary.tracking.lines)
     if summary.tracking:
         return _judge_record(summary.tracking, profile)
     if summary.swept_sine is not None:
@@ -135,6 +141,18 @@ def _judge_record(tracking: TrackingResult, profile: Profile) -> ExcitationVerdi
         reason=", ".join(faults) or text,
         outside=len(faults),
         worst_error=error,
+    )
+
+
+def _judge_lines(lines: SpectrumRatios) -> ExcitationVerdict:
+    """Return the verdict on a random motion or multisine from the levels of its lines."""
+    if lines.outside is None or lines.lowest_ratio is None or lines.highest_ratio is None:
+        return _decline("samples of the acceleration of the table are missing")
+    return ExcitationVerdict(
+        verdict="reached" if lines.outside <= (1.0 - MIN_INSIDE) * lines.count else "missed",
+        reason=format_lines(lines),
+        outside=lines.outside,
+        worst_error=max(lines.lowest_ratio - 1.0, lines.highest_ratio - 1.0, key=abs),
     )
 
 

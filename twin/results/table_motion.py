@@ -8,10 +8,16 @@ import numpy as np
 from table_io.block import Block, Float1D, Label
 from table_io.config.excitation import History, history_acceleration
 from table_io.config.excitation.record import RecordedHistory
+from table_io.config.excitation.synthetic import BandLimitedRandom
 from table_io.config.profile import Profile
 from table_io.config.tracking import RequiredSpectrum, TrackingConfig
 from twin.recording.reader import Recording
-from twin.results.contracts import RequiredSpectrumResult, TrackingError, TrackingResult
+from twin.results.contracts import (
+    RequiredSpectrumResult,
+    SpectrumRatios,
+    TrackingError,
+    TrackingResult,
+)
 from twin.results.spectra import (
     USUAL_PER_OCTAVE,
     compute_response_spectrum,
@@ -129,6 +135,7 @@ def summarise_tracking(recording: Recording, profile: Profile) -> TrackingResult
         from_s=motion.start / motion.rate_hz,
         to_s=motion.end / motion.rate_hz,
         required_spectrum=None if required is None else _check_required(motion, required, config),
+        lines=check_lines(motion, profile),
     )
 
 
@@ -162,34 +169,53 @@ def _check_required(
 ) -> RequiredSpectrumResult:
     """Return the check of the spectrum of the table against the required one."""
     hz = list_required_frequencies(required, motion.rate_hz)
-    result = RequiredSpectrumResult(
-        lower=config.required_lower,
-        upper=config.required_upper,
+    ratios = np.full(hz.size, np.nan)
+    if hz.size and np.isfinite(motion.achieved_acc_m_s2).all():
+        spectrum = compute_response_spectrum(
+            motion.achieved_acc_m_s2, motion.rate_hz, hz, config.damping
+        )
+        ratios = spectrum.absolute_acceleration_m_s2 / required.interpolate(hz)
+    result = _find_extremes(hz, ratios, (config.required_lower, config.required_upper))
+    return RequiredSpectrumResult(**dict(result), passed=result.outside == 0)
+
+
+def check_lines(motion: TableMotion, profile: Profile) -> SpectrumRatios | None:
+    """Return the amplitude of each excited line over that asked for, rms of the whole periods.
+
+    None of an excitation without lines, and if no period was played to its end.
+    """
+    excitation, rate_hz = profile.excitation, motion.rate_hz
+    if not isinstance(excitation, BandLimitedRandom):
+        return None
+    count = round(excitation.duration_s * rate_hz)
+    starts = motion.start - motion.first + excitation.list_starts(rate_hz).ravel()
+    starts = starts[starts + count <= motion.end - motion.first]
+    if not starts.size:
+        return None
+    lines = excitation.list_lines(rate_hz)
+    target, achieved = (
+        np.linalg.norm(np.fft.rfft(row[starts[:, None] + np.arange(count)])[:, lines], axis=0)
+        for row in (motion.target_acc_m_s2, motion.achieved_acc_m_s2)
+    )
+    alarm = profile.protection.alarm
+    return _find_extremes(lines * rate_hz / count, achieved / target, (1.0 - alarm, 1.0 + alarm))
+
+
+def _find_extremes(hz: Float1D, ratios: Float1D, allowed: tuple[float, float]) -> SpectrumRatios:
+    """Return the extremes of ratios at frequencies in Hz, (frequency,); NaN: samples are lost."""
+    known = bool(hz.size) and bool(np.isfinite(ratios).all())
+    lowest, highest = (int(np.argmin(ratios)), int(np.argmax(ratios))) if known else (0, 0)
+    outside = np.count_nonzero((ratios < allowed[0]) | (ratios > allowed[1]))
+    return SpectrumRatios(
+        lower=allowed[0],
+        upper=allowed[1],
         count=hz.size,
-        outside=None,
-        lowest_ratio=None,
-        lowest_hz=None,
-        highest_ratio=None,
-        highest_hz=None,
-        passed=False,
+        outside=int(outside) if known else None,
+        lowest_ratio=float(ratios[lowest]) if known else None,
+        lowest_hz=float(hz[lowest]) if known else None,
+        highest_ratio=float(ratios[highest]) if known else None,
+        highest_hz=float(hz[highest]) if known else None,
     )
-    if not hz.size or not np.isfinite(motion.achieved_acc_m_s2).all():
-        return result
-    spectrum = compute_response_spectrum(
-        motion.achieved_acc_m_s2, motion.rate_hz, hz, config.damping
-    )
-    ratios = spectrum.absolute_acceleration_m_s2 / required.interpolate(hz)
-    outside = int(
-        np.count_nonzero((ratios < config.required_lower) | (ratios > config.required_upper))
-    )
-    lowest, highest = int(np.argmin(ratios)), int(np.argmax(ratios))
-    result.outside = outside
-    result.lowest_ratio = float(ratios[lowest])
-    result.lowest_hz = float(hz[lowest])
-    result.highest_ratio = float(ratios[highest])
-    result.highest_hz = float(hz[highest])
-    result.passed = outside == 0
-    return result
 
 
 def format_tracking(tracking: TrackingResult) -> str:
@@ -201,10 +227,15 @@ def format_tracking(tracking: TrackingResult) -> str:
         f"table acceleration {_format_percent(tracking.acc_rms_error_band)} RMS off its target "
         f"in {band} ({_format_percent(tracking.acc_rms_error_full)} in full"
         + (f", {_format_percent(own)} off the record itself)" if math.isfinite(own) else ")"),
-        f"PGA {_format_percent(tracking.pga_ratio_band)} of it "
-        f"({_format_percent(tracking.pga_ratio_full)})",
     ]
-    if tracking.sa_count:
+    if tracking.lines is not None:
+        parts.append(format_lines(tracking.lines))
+    else:
+        parts.append(
+            f"PGA {_format_percent(tracking.pga_ratio_band)} of it "
+            f"({_format_percent(tracking.pga_ratio_full)})"
+        )
+    if tracking.sa_count and tracking.lines is None:
         inside = round(tracking.sa_share * tracking.sa_count)
         parts.append(f"{inside} of {tracking.sa_count} SA within 10 %")
     parts.append(f"lag {1e3 * tracking.lag_s:.3g} ms")
@@ -213,6 +244,18 @@ def format_tracking(tracking: TrackingResult) -> str:
     if tracking.required_spectrum is not None:
         parts.append(format_required(tracking.required_spectrum))
     return ", ".join(parts)
+
+
+def format_lines(lines: SpectrumRatios) -> str:
+    """Format the check of the lines of a multisine."""
+    if lines.lowest_ratio is None or lines.highest_ratio is None:
+        return "level of its lines unknown"
+    low, high = _format_percent(lines.lowest_ratio), _format_percent(lines.highest_ratio)
+    return (
+        f"{lines.outside} of {lines.count} lines are off their level by more than "
+        f"{_format_percent(1.0 - (lines.lower or 0.0))}; they have {low} of it at "
+        f"{lines.lowest_hz:.3g} Hz to {high} at {lines.highest_hz:.3g} Hz"
+    )
 
 
 def format_required(required: RequiredSpectrumResult) -> str:

@@ -107,6 +107,11 @@ class BandLimitedRandom(History):
         f = np.fft.rfftfreq(round(self.duration_s * rate_hz), 1.0 / rate_hz)
         return np.flatnonzero((f >= self.low_hz) & (f <= self.high_hz))
 
+    def list_starts(self, rate_hz: float) -> npt.NDArray[np.int64]:
+        """Return the first samples of the whole periods in its target, (realisation, period)."""
+        before = DRIVE_MARGIN_S if self.drive is not None else 0.0
+        return np.array([[round(before * rate_hz) + round(self.ramp_s * rate_hz)]])
+
     def _make_period(self, rate_hz: float, seed: int) -> Float1D:
         """Return a period with the phases of a seed in m, (sample,)."""
         count = round(self.duration_s * rate_hz)
@@ -163,9 +168,8 @@ class PeriodicMultisine(BandLimitedRandom):
         """Return the first samples of the measured periods in its target, (realisation, period)."""
         count, ramp = round(self.duration_s * rate_hz), round(self.ramp_s * rate_hz)
         whole = (self.periods + 1) * count + 2 * ramp + 1
-        before = round(DRIVE_MARGIN_S * rate_hz) if self.drive is not None else 0
-        first = whole * np.arange(self.realisations) + before + ramp + count
-        return np.asarray(first[:, None] + count * np.arange(self.periods))
+        first = super().list_starts(rate_hz) + whole * np.arange(self.realisations)[:, None]
+        return np.asarray(first + count * np.arange(1, self.periods + 1))
 
     def displacement(self, rate_hz: float) -> Float1D:
         """Return all realisations in m, each from rest to rest, (sample,)."""
