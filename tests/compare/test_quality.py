@@ -35,7 +35,7 @@ def set_samples(first: int, values: list[float]) -> Callable[[Float1D], Float1D]
 def find(channels: dict[str, Float1D]) -> dict[tuple[str, str], list[int]]:
     """Return the bad samples by (channel, reason)."""
     samples: dict[tuple[str, str], list[int]] = {}
-    for gap in find_bad_samples(channels, RATE_HZ):
+    for gap in find_bad_samples(channels):
         samples.setdefault((gap.channel, gap.reason), []).extend(range(gap.index, gap.end))
     return samples
 

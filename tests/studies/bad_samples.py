@@ -57,7 +57,7 @@ def make_clean(seed: int, component: bool, rate_hz: float) -> Mapping[str, Float
 
 def list_findings(channels: Mapping[str, Float1D], rate_hz: float) -> set[tuple[str, str]]:
     """Return (kind, channel) of all that the product finds."""
-    gaps = find_bad_samples(channels, rate_hz)
+    gaps = find_bad_samples(channels)
     good = {name: np.array(values) for name, values in channels.items()}
     for gap in gaps:
         good[gap.channel][gap.index : gap.end] = np.nan
@@ -178,7 +178,7 @@ def is_found(kind: str, size: int, seed: int = 0) -> bool:
     bad, name, at = plant(kind, size, {**clean}, rate_hz, rng)
     findings = list_findings(bad, rate_hz)
     if at.any():
-        gaps = [g for g in find_bad_samples(bad, rate_hz) if g.channel == name]
+        gaps = [g for g in find_bad_samples(bad) if g.channel == name]
         marked = np.zeros(at.size, dtype=bool)
         for gap in gaps:
             marked[gap.index : gap.end] = True

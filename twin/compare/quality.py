@@ -3,7 +3,7 @@
 Bad samples become gaps with a reason, so that nobody fits them:
 
     wild       far from both neighbours, and nothing else jumps with it: sentinels, dropouts
-    clipped    equal samples at the end of a range, entered at speed
+    clipped    samples at the end of a range, equal or within a noise, entered at speed
     stuck      equal samples while the channel was in motion and others still are
 
 A channel as a whole is a question, since only its owner knows what happened to it:
@@ -14,10 +14,11 @@ A channel as a whole is a question, since only its owner knows what happened to 
     swapped    it shows what another channel should
 
 Nothing here knows the specimen: a finding compares a channel with itself or with another one of
-the same motion. `drive_disp_m` is a command, which may be anything.
+the same motion. `drive_disp_m` is a command, which may be anything: it is judged only where it
+is said to have been played.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +50,8 @@ MIN_CLIPPED_RUN = 3  # equal samples at an extreme, where no others are equal
 MIN_LEVEL_RATIO = 6.0  # of that run over those of the next levels: 4.8 on a quantised sine
 MAX_END_RATIO = 3.0  # of a run at the beginning or end over the others: longer, it is a rest
 MAX_OVERSHOOT = 2.0  # of the range, that speed and length of a flat top foretell: else a dwell
+CLIPPING_NOISE = 1e-4  # of the range, within which a flat top that carries noise stays
+MIN_ENTRY = 10.0  # times that noise, by which a sample enters and leaves such a top: no peak does
 MIN_STUCK_RUN, MIN_STUCK_RATIO = 5, 4.0  # samples; over how long the longest readings last
 LASTING_SHARE = 0.99  # of the readings, which last less
 MIN_STUCK_STEP = 10.0  # resolutions by which a stuck channel is off when it moves again
@@ -92,21 +95,23 @@ class ChannelDoubt:
     remedy: str
 
 
-def find_bad_samples(channels: Mapping[str, Float1D], rate_hz: float) -> list[SampleGap]:
+def find_bad_samples(
+    channels: Mapping[str, Float1D], judged: Container[str] = JUDGED
+) -> list[SampleGap]:
     """Return the bad samples of channels in SI, (sample,) each with NaN in gaps, by reason."""
     cleaned = {
         name: np.array(values)
         for name, values in channels.items()
-        if name in JUDGED and np.isfinite(values).sum() >= MIN_SAMPLES
+        if name in judged and np.isfinite(values).sum() >= MIN_SAMPLES
     }
     gaps = []
     for name, spans in _find_wild(cleaned).items():
         gaps += _take_out(cleaned, name, spans, "wild")
     for name, values in cleaned.items():
-        gaps += _take_out(cleaned, name, _find_clipped(values), "clipped")
+        gaps += _take_out(cleaned, name, _find_clipped(name, values), "clipped")
     for name, values in cleaned.items():
         if not find_hold(values):
-            gaps += _take_out(cleaned, name, _find_stuck(cleaned, name), "stuck")
+            gaps += _take_out(cleaned, name, _find_stuck({**channels, **cleaned}, name), "stuck")
     return gaps
 
 
@@ -128,7 +133,7 @@ def clean_blocks(blocks: Sequence[Block], where: str) -> tuple[tuple[Block, ...]
         return (), []
     joined = join_with_gaps(blocks)
     first, channels = joined.index, dict(zip(joined.channels, joined.values, strict=True))
-    gaps = find_bad_samples(channels, blocks[0].rate_hz)
+    gaps = find_bad_samples(channels)
     lines = describe_gaps(gaps, channels)
     cleaned = {name: np.array(values) for name, values in channels.items()}
     for gap in gaps:
@@ -269,35 +274,55 @@ def _find_jumping_runs(x: Float1D) -> Iterator[Span]:
         k += 1
 
 
-def _find_clipped(values: Float1D) -> list[Span]:
-    """Return the runs of equal samples at the extremes of a channel, if they are cut off there."""
+def _find_clipped(name: str, values: Float1D) -> list[Span]:
+    """Return the flat parts at the extremes of a channel, if they are cut off there."""
     rows = np.flatnonzero(np.isfinite(values))
     x = values[rows]
     if x.size < MIN_SAMPLES or np.ptp(x) == 0.0:
         return []
-    levels = np.unique(x)
+    noise = CLIPPING_NOISE * float(np.ptp(x))
     spans: list[Span] = []
-    for extreme, others in ((levels[-1], levels[-4:-1]), (levels[0], levels[1:4])):
-        runs = find_stretches(x == extreme)
-        longest = max(end - first for first, end in runs)
-        usual = max(end - first for level in others for first, end in find_stretches(x == level))
-        is_fine = levels.size > 0.25 * x.size
-        least = MIN_CLIPPED_RUN if is_fine and usual == 1 else MIN_LEVEL_RATIO * usual
-        if longest < max(least, MIN_CLIPPED_RUN) or extreme == 0.0:
+    for extreme in (float(x.max()), float(x.min())):
+        if extreme == 0.0:
             continue
-        inner = [(a, b) for a, b in runs if a > 1 and b < x.size - 1]
-        at_ends = max((b - a for a, b in runs if a == 0 or b == x.size), default=0)
-        if at_ends > MAX_END_RATIO * max((b - a for a, b in inner), default=0):  # it rests there
-            continue
-        foretold = [
-            0.25 * (b - a) * max(abs(x[a - 1] - x[a - 2]), abs(x[b + 1] - x[b]))
-            for a, b in inner
-            if b - a >= MIN_CLIPPED_RUN
-        ]
-        if not foretold or np.median(foretold) > MAX_OVERSHOOT * np.ptp(x):
-            continue
-        spans += [(int(rows[a]), int(rows[b - 1]) + 1) for a, b in inner]
+        depth = np.abs(x - extreme)
+        parts = _list_flat_tops(x, depth)
+        # between contacts a load cell rests, and has noise there
+        is_rest = name in (*RIGHT_CELLS, *LEFT_CELLS) and 2.0 * np.median(depth) < np.ptp(x)
+        if not (parts or is_rest):
+            parts = _list_flat_tops(x, np.floor(depth / noise), MIN_ENTRY * noise)
+        spans += [(int(rows[a]), int(rows[b - 1]) + 1) for a, b in parts]
     return sorted(spans)
+
+
+def _list_flat_tops(x: Float1D, depth: Float1D, least_entry: float = 0.0) -> list[Span]:
+    """Return the parts of a signal where its depth below an extreme is 0, if it is cut off there.
+
+    `least_entry`: of the samples before and after them, which are that far apart from the next.
+    """
+    levels = np.unique(depth)
+    runs = find_stretches(depth == 0.0)
+    longest = max(end - first for first, end in runs)
+    usual = max(
+        end - first for level in levels[1:4] for first, end in find_stretches(depth == level)
+    )
+    is_fine = levels.size > 0.25 * x.size
+    least = MIN_CLIPPED_RUN if is_fine and usual == 1 else MIN_LEVEL_RATIO * usual
+    if longest < max(least, MIN_CLIPPED_RUN):
+        return []
+    inner = [(a, b) for a, b in runs if a > 1 and b < x.size - 1]
+    at_ends = max((b - a for a, b in runs if a == 0 or b == x.size), default=0)
+    if at_ends > MAX_END_RATIO * max((b - a for a, b in inner), default=0):  # it rests there
+        return []
+    entries = [
+        (max(abs(x[a - 1] - x[a - 2]), abs(x[b + 1] - x[b])), b - a)
+        for a, b in inner
+        if b - a >= MIN_CLIPPED_RUN
+    ]
+    if not entries or np.median([speed for speed, _ in entries]) < least_entry:
+        return []
+    foretold = np.median([0.25 * length * speed for speed, length in entries])
+    return inner if foretold <= MAX_OVERSHOOT * np.ptp(x) else []
 
 
 def _find_stuck(channels: Mapping[str, Float1D], name: str) -> list[Span]:

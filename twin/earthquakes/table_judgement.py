@@ -14,8 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from table_io.block import Float1D, find_stretches
+from table_io.block import Float1D
 from table_io.errors import InputError
+from twin.compare.quality import find_bad_samples
 from twin.earthquakes.result import HYDRAULIC, ChannelEstimate, JudgedErrors, JudgedRun, Judgement
 from twin.earthquakes.table_effects import LIBRARY
 from twin.earthquakes.table_identification import (
@@ -53,17 +54,10 @@ RESONANT_WIDTH_HZ = 0.5  # on either side of a peak that is no command's
 MAX_HYDRAULIC_S = 180.0  # of logs to which the hydraulic table is fitted, at half a second each
 PART_COUNT = 4  # of a single log, that are left out in turn
 MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler structure is not worse up to this
-MIN_CLIPPED_SAMPLES, MIN_CLIPPED_PARTS = 4, 2  # equal samples at an extreme, and how often
-# Of its peak by which the other signal goes beyond both ends of such a part. At the extreme of a
-# sine a late one moves by some percent, but to one side.
-MOVING_SHARE = 0.01
-CLIPPING_TOLERANCE = 1e-4  # of the range, round an extreme: a clipped signal may carry noise
-MIN_HELD_S = 0.5  # of one value while the other signal moves
 MIN_CORRELATION = 0.7  # of channels of one motion, by size: less says nothing of sign and lag
 MAX_LAG_S, SEARCHED_LAG_S = 0.5, 5.0  # of a slow table, and of a log on two clocks
 GAIN_LIMITS = 0.2, 5.0  # of displacement over command
 ACCELEROMETER_LIMITS = 0.7, 1.4  # of acceleration over the derivative of the displacement
-DERIVATIVE_BAND_HZ = 0.3, 10.0  # of a displacement, with little noise
 ACCELEROMETER_BAND_HZ = 0.8, 5.0  # where both are usually well above their noise
 MAX_ERROR = 1e3  # that is stated: a twin that diverges
 
@@ -91,13 +85,17 @@ def check_motion(named: NamedMotion) -> None:
     for row, channel in ((command, "drive_disp_m"), (displacement, "table_disp_m")):
         if not np.ptp(row) > 0.0:
             raise InputError("does not change: the table rests", where=log, key=channel)
-    others = {"table_disp_m": (displacement, command), "drive_disp_m": (command, displacement)}
+    rows = {"drive_disp_m": command, "table_disp_m": displacement}
     if motion.has_accelerometer:
-        projection = BandProjection(command.size, motion.rate_hz, DERIVATIVE_BAND_HZ)
-        derived = projection.to_samples(projection.differentiate(displacement))
-        others["table_acc_m_s2"] = (motion.acceleration_m_s2, derived)
-    for channel, (row, other) in others.items():
-        _check_saturation(log, channel, row, other, motion.rate_hz)
+        rows["table_acc_m_s2"] = motion.acceleration_m_s2
+    for gap in find_bad_samples(rows, rows):
+        raise InputError(
+            f"is {gap.reason} from {gap.index / motion.rate_hz:.1f} s of the motion",
+            where=log,
+            key=gap.channel,
+            remedy="leave that part out at the import, or record the motion again in the range of "
+            "the sensor",
+        )
     correlation, lag_s = _correlate(command, displacement, motion.rate_hz)
     if correlation < -MIN_CORRELATION:
         raise InputError(
@@ -124,44 +122,6 @@ def check_motion(named: NamedMotion) -> None:
         )
     if motion.has_accelerometer:
         _check_accelerometer(named)
-
-
-def _check_saturation(log: str, channel: str, row: Float1D, other: Float1D, rate_hz: float) -> None:
-    """Raise InputError if a signal stays at a value, or at an extreme, while another one moves."""
-
-    def list_parts(stays: npt.NDArray[np.bool_], least: float) -> list[int]:
-        """Return the first samples of parts in which one stays and the other goes and returns."""
-        limit = MOVING_SHARE * np.abs(other).max()
-        moving = []
-        for start, end in find_stretches(stays):
-            part = other[start:end]
-            ends = sorted((part[0], part[-1]))
-            beyond = max(part.max() - ends[1], ends[0] - part.min())
-            if end - start >= least and beyond > limit:
-                moving.append(start)
-        return moving
-
-    tolerance = CLIPPING_TOLERANCE * np.ptp(row)
-    clipped = [
-        start
-        for stays in (row >= row.max() - tolerance, row <= row.min() + tolerance)
-        for start in list_parts(stays, MIN_CLIPPED_SAMPLES)
-    ]
-    if len(clipped) >= MIN_CLIPPED_PARTS:
-        raise InputError(
-            f"is clipped: it stays at an extreme value {len(clipped)} times while the table moves",
-            where=log,
-            key=channel,
-            remedy="record the motion again within the range of the sensor",
-        )
-    if held := list_parts(np.diff(row) == 0.0, MIN_HELD_S * rate_hz):
-        raise InputError(
-            f"is stuck from {held[0] / rate_hz:.1f} s of the motion: its value does not change "
-            "while the table moves",
-            where=log,
-            key=channel,
-            remedy="leave that part out at the import",
-        )
 
 
 def _correlate(command: Float1D, displacement: Float1D, rate_hz: float) -> tuple[float, float]:

@@ -451,7 +451,7 @@ def _judge_quality(
         for name, values in samples.channels.items()
         if not (name in sources and sources[name].trusted)
     }
-    bad = find_bad_samples(channels, rate_hz)
+    bad = find_bad_samples(channels)
     lines = [f"warning: {line}" for line in describe_gaps(bad, channels)]
     for gap in bad:
         channels[gap.channel][gap.index : gap.end] = np.nan
