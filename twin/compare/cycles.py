@@ -117,16 +117,8 @@ def cycle_extremes(
         )
         onsets.append(tuple(first + index for index in indices))
         after.append(is_in_contact)
-    return Extremes(
-        float(u.max()),
-        float(u.min()),
-        float(a.max()),
-        float(a.min()),
-        forces[0],
-        forces[1],
-        onsets[0],
-        onsets[1],
-    ), (after[0], after[1])
+    ends = (float(u.max()), float(u.min()), float(a.max()), float(a.min()))
+    return Extremes(*ends, forces[0], forces[1], onsets[0], onsets[1]), (after[0], after[1])
 
 
 OnsetDepths = tuple[Float2D, Float2D]  # (right, left), each (2, onset) in m

@@ -37,25 +37,19 @@ def detect_attractor_change(
         if not np.isfinite(amplitude):
             return state, []
     recent = (*state.recent, amplitude)[-STEADY_CYCLES:]
-    steady_amplitude = state.steady_amplitude
-    if (
-        steady_amplitude is None
-        or abs(amplitude - steady_amplitude) <= MIN_AMPLITUDE_CHANGE * steady_amplitude
-    ):
-        is_steady = len(recent) == STEADY_CYCLES and float(
-            np.ptp(recent)
-        ) <= MAX_STEADY_RANGE * float(np.mean(recent))
-        return AttractorState(
-            drive_key, recent, float(np.mean(recent)) if is_steady else steady_amplitude
-        ), []
-    if not all(
-        abs(value - steady_amplitude) > MIN_AMPLITUDE_CHANGE * steady_amplitude
+    steady = state.steady_amplitude
+    others = [
+        steady is not None and abs(value - steady) > MIN_AMPLITUDE_CHANGE * steady
         for value in recent[-CONFIRMING_CYCLES:]
-    ):
-        return AttractorState(drive_key, recent, steady_amplitude), []
+    ]
+    if steady is None or not all(others):
+        mean = float(np.mean(recent))
+        is_steady = len(recent) == STEADY_CYCLES and np.ptp(recent) <= MAX_STEADY_RANGE * mean
+        settles = is_steady and not others[-1]
+        return AttractorState(drive_key, recent, mean if settles else steady), []
     text = (
         f"the motion has changed to another one at {cycle.step.frequency_hz:g} Hz "
         f"{cycle.step.direction}, cycle {cycle.number}: amplitude of u "
-        f"{1e3 * steady_amplitude:.3g} -> {1e3 * amplitude:.3g} mm"
+        f"{1e3 * steady:.3g} -> {1e3 * amplitude:.3g} mm"
     )
     return AttractorState(drive_key, (), None), [Event(cycle.end, "attractor", text)]

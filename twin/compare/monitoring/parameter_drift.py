@@ -132,31 +132,22 @@ def _add_cycle(
     time_s = cycle.end / rate_hz - 0.5 * duration_s
     last = chunks[-1] if chunks else None
     if last is None or last.step != cycle.step.index or last.full:
-        size = rows.shape[1]
-        last = Chunk(
-            time_s,
-            0.0,
-            cycle.step.frequency_hz,
-            cycle.step.index,
-            0,
-            0.0,
-            np.zeros((size, size)),
-            np.zeros(size),
-        )
+        step, zeros = cycle.step, np.zeros(rows.shape[1])
+        matrix = np.zeros((zeros.size, zeros.size))
+        last = Chunk(time_s, 0.0, step.frequency_hz, step.index, 0, 0.0, matrix, zeros)
     else:
         chunks = chunks[:-1]
     log_amplitude = float(
         np.log(max(np.ptp(relative_displacement(cycle.corrected)), MIN_AMPLITUDE_M))
     )
-    grown = Chunk(
-        last.time_s + (time_s - last.time_s) / (last.count + 1),
-        last.log_amplitude + (log_amplitude - last.log_amplitude) / (last.count + 1),
-        last.frequency_hz,
-        last.step,
-        last.count + 1,
-        last.duration_s + duration_s,
-        last.matrix + (rows[:, :, None] * rows[:, None, :]).sum(axis=0),
-        last.rhs + (rows * values[:, None]).sum(axis=0),
+    grown = replace(
+        last,
+        time_s=last.time_s + (time_s - last.time_s) / (last.count + 1),
+        log_amplitude=last.log_amplitude + (log_amplitude - last.log_amplitude) / (last.count + 1),
+        count=last.count + 1,
+        duration_s=last.duration_s + duration_s,
+        matrix=last.matrix + (rows[:, :, None] * rows[:, None, :]).sum(axis=0),
+        rhs=last.rhs + (rows * values[:, None]).sum(axis=0),
     )
     return (*(_merge_pairs(chunks) if len(chunks) >= MAX_CHUNKS else chunks), grown)
 
@@ -171,15 +162,14 @@ def _merge_pairs(chunks: tuple[Chunk, ...]) -> tuple[Chunk, ...]:
             merged.append(chunk)
             is_pair = False
             continue
-        merged[-1] = Chunk(
-            0.5 * (last.time_s + chunk.time_s),
-            0.5 * (last.log_amplitude + chunk.log_amplitude),
-            chunk.frequency_hz,
-            chunk.step,
-            last.count + chunk.count,
-            last.duration_s + chunk.duration_s,
-            last.matrix + chunk.matrix,
-            last.rhs + chunk.rhs,
+        merged[-1] = replace(
+            chunk,
+            time_s=0.5 * (last.time_s + chunk.time_s),
+            log_amplitude=0.5 * (last.log_amplitude + chunk.log_amplitude),
+            count=last.count + chunk.count,
+            duration_s=last.duration_s + chunk.duration_s,
+            matrix=last.matrix + chunk.matrix,
+            rhs=last.rhs + chunk.rhs,
         )
         is_pair = True
     return tuple(merged)

@@ -88,13 +88,8 @@ def check_consistency(
     cycles: list[int] = []
     items: list[Record] = []
     for count, text in zip(state.cycles, findings, strict=True):
-        new_count = (
-            count
-            if text is None or (text and count == ALREADY_REPORTED)
-            else count + 1
-            if text
-            else 0
-        )
+        is_kept = text is None or (text and count == ALREADY_REPORTED)
+        new_count = count if is_kept else count + 1 if text else 0
         if new_count == MIN_DOUBTFUL_CYCLES and text:
             items.append(Event(cycle.end, "instrument", text))
             new_count = ALREADY_REPORTED
