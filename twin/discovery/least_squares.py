@@ -16,7 +16,7 @@ from twin.discovery.parameters import (
     ParameterSet,
     get_log,
 )
-from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
+from twin.discovery.residuals import LogResiduals
 
 MAX_ITERATIONS = 40
 MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
@@ -103,17 +103,12 @@ def fit_with_misfit(
     folds: Sequence[Int1D] = (),
     mapper: MapFunction = map,
 ) -> FitResult:
-    """Fit without noise; where the model leaves more than noise, that counts as noise too.
+    """Fit without noise; what the model leaves beyond noise counts as noise too.
 
     Else nuisances would run as far as lowers it, whatever their priors. The cost and the
     cross-validation residual of the result are over the noise alone nevertheless.
     """
     fit = fit_parameters(log_residuals, start, mapper=mapper)
-    left = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
-    if not fit.free or measure_level(log_residuals, left) <= MAX_LEVEL:
-        return fit_parameters(
-            log_residuals, fit.parameters, folds=folds, mapper=mapper, without_noise=True
-        )
     weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
     ratios = [
         new.entry_weight / old.entry_weight

@@ -740,12 +740,14 @@ class LogResiduals:
     def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
         """Return the residuals with what a fitted model leaves counted as noise of single steps.
 
+        What may remain where the residual is said to be noise is none.
         So the priors of the nuisances are not outvoted by a misfit that is no error of theirs.
         """
         squares, factors = self.evaluate(parameters) ** 2, {}
         for row, name in enumerate(self.rows):
             own = squares[self.entry_row == row]
-            excess = max(float(own.sum()) - self.expected_squares.get(name, 1.0) * own.size, 0.0)
+            noise = MAX_LEVEL * self.expected_squares.get(name, 1.0) * own.size
+            excess = max(float(own.sum()) - noise, 0.0)
             factors[name] = math.sqrt(1.0 + excess / self._count_different(own))
         factors["rest"] = max(factors.values())
         weights = {name: factor * self.weights.get(name, 1.0) for name, factor in factors.items()}
