@@ -185,7 +185,7 @@ def draw_pair_cases(seeds: range) -> Iterator[Case]:
 
 STRANGERS: dict[str, tuple[str, str, dict[str, float]]] = {
     "soft layer": ("g4", "bumper", {"soft_depth": 4e-4, "soft_share": 0.3}),
-    "flexible mount": ("g4", "bumper", {"mount_k": 1.5e6}),
+    "flexible mount": ("g4", "bumper", {"mount_k": 1.5e6, "mount_kg": 20.0}),
     "hertz": ("g4", "bumper", {"stop_power": 1.5}),
     "friction with u": ("g10", "damper", {"friction_u": 4000.0}),
     "saturating spring": ("g10", "damper", {"tanh_force": 30.0, "tanh_u": 1e-3}),

@@ -23,7 +23,7 @@ SLOTS = (
     "k", "c", "kr", "cr", "kl", "cl", "gap_r", "gap_l", "k3", "c2", "fc", "stribeck", "bw_force",
     "bw_yield", "k1", "tau", "k2", "hc", "soft_depth", "soft_share", "mount_k", "kb", "tau_b",
     "pull", "friction_u", "softening", "preload", "warming", "cooling", "tanh_force", "tanh_u",
-    "k5", "lifted", "dead_band", "wear", "stop_power", "tilt", "plate_mass",
+    "k5", "lifted", "dead_band", "wear", "stop_power", "tilt", "plate_mass", "mount_kg",
 )  # fmt: skip
 SLOT = {name: number for number, name in enumerate(SLOTS)}
 
@@ -46,7 +46,7 @@ class Specimen:
         base = {
             "k": self.k, "c": self.c, "kr": self.kb, "cr": self.cb, "kl": self.kb, "cl": self.cb,
             "gap_r": gap, "gap_l": gap, "bw_yield": 1e-3, "tau": 0.05, "tau_b": 0.02,
-            "mount_k": 0.0, "tanh_u": 1e-3, "wear": 0.0,
+            "tanh_u": 1e-3,
         }  # fmt: skip
         for name, value in {**base, **self.hidden}.items():
             p[SLOT[name]] = value
@@ -79,8 +79,6 @@ def _bumper(p, d, w, k, c, q, t):
     if p[18] > 0.0:
         soft = p[19] * k
         force = soft * d if d < p[18] else soft * p[18] + k * (d - p[18])
-    elif p[20] > 0.0:
-        force = k * p[20] / (k + p[20]) * d
     else:
         force = k * d
     if p[35] > 0.0:
@@ -93,9 +91,9 @@ def _bumper(p, d, w, k, c, q, t):
 def _rates(p, mass, y, table_acc, table_disp, t, out):
     u, v, z, q, qr, ql = y[0], y[1], y[2], y[3], y[4], y[5]
     opened = p[34] * t
-    dr, dl = u - p[6] - opened, -u - p[7] - opened
-    fr = _bumper(p, dr, v, p[2], p[3], qr, t)
-    fl = _bumper(p, dl, -v, p[4], p[5], ql, t)
+    dr, dl = u - p[6] - opened - y[6], -u - p[7] - opened - y[8]
+    fr = _bumper(p, dr, v - y[7], p[2], p[3], qr, t)
+    fl = _bumper(p, dl, -v - y[9], p[4], p[5], ql, t)
     fd = _damper(p, u, v, z, q, t)
     out[0] = v
     out[1] = -(fd + fr - fl) / mass - table_acc - GRAVITY_M_S2 * p[36] * table_disp
@@ -104,13 +102,17 @@ def _rates(p, mass, y, table_acc, table_disp, t, out):
     out[3] = (u - q) / p[15]
     out[4] = (max(dr, 0.0) - qr) / p[22]
     out[5] = (max(dl, 0.0) - ql) / p[22]
+    if p[38] > 0.0:  # each bumper stands on a mass of its own, on a spring with 3 % of damping
+        damping = 0.06 * np.sqrt(p[20] * p[38])
+        out[6], out[7] = y[7], (fr - p[20] * y[6] - damping * y[7]) / p[38] - table_acc
+        out[8], out[9] = y[9], (fl - p[20] * y[8] - damping * y[9]) / p[38] + table_acc
     return fr, fl, fd
 
 
 @numba.njit(cache=True)
 def _integrate(p, mass, acc, disp, dt, out):
-    y = np.zeros(6)
-    k1, k2, k3, k4, s = np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(6)
+    y = np.zeros(10)
+    k1, k2, k3, k4, s = np.zeros(10), np.zeros(10), np.zeros(10), np.zeros(10), np.zeros(10)
     for i in range(acc.size // 2):
         t = i * dt
         fr, fl, fd = _rates(p, mass, y, acc[2 * i], disp[2 * i], t, k1)
