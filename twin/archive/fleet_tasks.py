@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from twin.archive.run_row import Row
-from twin.discovery.task import discover, identify
 from twin.inspection.curves import read_curves
 from twin.replay.command import tabulate_replay
 from twin.replay.task import RECORDED, open_replay_log, select_span
@@ -67,6 +66,8 @@ def replay_log(log: Path, model: str | None, folder: Path) -> Row:
 
 def identify_log(log: Path, model: str | None, folder: Path) -> Row:
     """Return the parameters that one log determines, with 95 % intervals; writes model.toml."""
+    from twin.discovery.task import identify  # takes longer to import than a log to verify
+
     fitted = identify([log], model or DEFAULT_MODEL)
     folder.mkdir()
     fitted.save_model(folder / "model.toml")
@@ -78,6 +79,8 @@ def identify_log(log: Path, model: str | None, folder: Path) -> Row:
 
 def discover_log(log: Path, model: str | None, folder: Path) -> Row:
     """Return the verdict on what the model lacks in a log; writes verdict.json and model.toml."""
+    from twin.discovery.task import discover
+
     discovered = discover([log], model or DEFAULT_MODEL)
     folder.mkdir()
     discovered.write(folder)

@@ -14,7 +14,6 @@ from rich.table import Table
 from table_io.block import Block
 from table_io.clock import RealClock
 from table_io.errors import InputError
-from twin.live.replay_publishing import open_publisher
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import parse_step_range
@@ -135,6 +134,8 @@ def _replay_one(request: ReplayRequest) -> int:
 @contextmanager
 def _observe(request: ReplayRequest, speed: float | None, run: ShownRun) -> Iterator[ItemHandler]:
     """Show the progress of a replay, at a multiple of real time if `speed`; publish if asked."""
+    from twin.live.replay_publishing import open_publisher  # slow to import
+
     publishing = (
         open_publisher(run.config, request.publish, request.keys)
         if request.publish

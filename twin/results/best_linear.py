@@ -11,8 +11,6 @@ Schoukens, System Identification, 2nd ed. 2012, sections 3.4 and 4.3.1 (robust m
 
 import numpy as np
 import numpy.typing as npt
-from scipy import stats
-from scipy.interpolate import CubicSpline
 
 from table_io.block import Float1D, Int1D
 from table_io.config.excitation.synthetic import PeriodicMultisine
@@ -87,6 +85,9 @@ def approximate(
 
     `lines` are the excited ones; neighbouring lines are `step_hz` apart.
     """
+    from scipy.interpolate import CubicSpline  # slow to import, and few tests are multisines
+    from scipy.special import fdtri
+
     realisations, periods, _ = outputs.shape
     excited = np.isin(shown, lines)
     turn = np.conj(command[..., excited])
@@ -101,7 +102,7 @@ def approximate(
     distortion = np.maximum(scatter - noise / periods, 0.0)
     power = (np.abs(outputs.mean(axis=1)) ** 2).mean(0)
     size = (np.abs(inputs.mean(axis=1)) ** 2).mean(0)
-    ratio = stats.f.ppf(CONFIDENCE_LEVEL, 2, 2 * (realisations - 1))
+    ratio = fdtri(2, 2 * (realisations - 1), CONFIDENCE_LEVEL)
     radius = np.sqrt(ratio * scatter / realisations / size)
     even = (shown % 2 == 0) & ~excited
     odd = (shown % 2 == 1) & ~excited
