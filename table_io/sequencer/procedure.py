@@ -50,16 +50,17 @@ from table_io.sequencer.orbits import (
     decide_orbit,
     resume_continuation,
 )
-from table_io.sequencer.state import SequencerState, Stage, TestPlan
+from table_io.sequencer.state import MAX_HOLD_S, SequencerState, Stage, TestPlan
 from table_io.sequencer.swept_sine import (
     begin_swept_sine,
     check_swept_channels,
     decide_sweep_level,
+    hold_sweep,
+    resume_sweep,
 )
 
 MIN_TUNING_WINDOW_S = 0.3  # shortest evaluation window, rounded up to whole cycles
 MIN_SETTLE_S = 0.3  # from a blend to the window; at least one cycle
-MAX_HOLD_S = 3600.0  # an operator's hold times out after this
 
 
 def begin_excitation(state: SequencerState) -> SequencerState:
@@ -415,7 +416,9 @@ def answer_block(
 
 
 def hold_test(state: SequencerState, index: int) -> SequencerState:
-    """Hold the step that contains sample `index`; return the state unchanged without one."""
+    """Hold the step or frequency at sample `index`; return the state unchanged without one."""
+    if state.stage.kind == "sweep":
+        return hold_sweep(state, index)
     if not state.steps or state.stage.kind in ("check", "open") or index >= state.drive.planned_end:
         return state
     trajectory = state.mark_queued().trajectory.cut(index)
@@ -426,7 +429,9 @@ def hold_test(state: SequencerState, index: int) -> SequencerState:
 
 
 def resume_test(state: SequencerState, index: int) -> SequencerState:
-    """Resume from a hold: tune and measure the step again."""
+    """Resume from a hold: tune and measure the step again, or go on with the sweep."""
+    if state.sweep is not None:
+        return resume_sweep(state, index)
     if state.stage.kind != "open":
         return state
     state = state.mark_queued()

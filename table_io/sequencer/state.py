@@ -17,6 +17,8 @@ from table_io.excitation.trajectory import UNCHANGED, SweptPosition, Trajectory
 from table_io.records import OrbitPoint, Record, Step, SweepLevel
 from table_io.safety.loop_check_data import PreloadLimits
 
+MAX_HOLD_S = 3600.0  # an operator's hold times out after this
+
 
 @dataclass(frozen=True, slots=True)
 class TestPlan:
@@ -94,7 +96,7 @@ class SweepSearch:
 
     Windows begin at sample `since` or later, behind a soft start. `passes` are the levels measured
     by pass or dwell. `dwells` are the resonances in Hz still ahead, None while the passes last; the
-    present dwell ends at sample `until`.
+    present dwell ends at sample `until`; the operator holds the frequency since `held_from`.
     """
 
     position: SweptPosition
@@ -102,6 +104,12 @@ class SweepSearch:
     passes: Mapping[int, tuple[SweepLevel, ...]] = field(default_factory=dict)
     dwells: tuple[float, ...] | None = None
     until: int = 0
+    held_from: int | None = None
+
+    @property
+    def is_held(self) -> bool:
+        """True while the operator holds the frequency."""
+        return self.held_from is not None
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ with the last level and correction, and ends at rest, whatever becomes of the de
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -41,11 +41,12 @@ from table_io.excitation.trajectory import (
     SETTLE_UPDATES,
     SineTarget,
     SweptPosition,
+    Trajectory,
     append_swept,
     start_swept,
 )
 from table_io.records import Event, SweepLevel
-from table_io.sequencer.state import SequencerState, Stage, SweepSearch
+from table_io.sequencer.state import MAX_HOLD_S, SequencerState, Stage, SweepSearch
 
 PREVIEW_LEADS = 3.0  # lead times of the queue that are planned ahead of a decision
 COMMAND_SHARE = 0.98  # of the limits of the rig that a corrected command may use
@@ -106,7 +107,9 @@ def _append_parts(state: SequencerState) -> SequencerState:
     config = _config(state)
     while True:
         position, end = _sweep(state).position, state.trajectory.end
-        if position.sweep < config.passes or end < _sweep(state).until:
+        if end - (_sweep(state).held_from or end) > MAX_HOLD_S * state.trajectory.rate_hz:
+            return replace(state, stage=Stage("open"), drive=state.trajectory.to_drive(()))
+        if position.sweep < config.passes or end < _sweep(state).until or _sweep(state).is_held:
             state = _append_part(state)
         else:
             state = _approach_next_dwell(state)
@@ -130,15 +133,66 @@ def _append_part(state: SequencerState) -> SequencerState:
         level = _limit_level(state, levels, frequency_hz, before)
         return level, _choose_correction(state, levels, frequency_hz, level, before)
 
-    if position.sweep < config.passes:
+    if position.sweep < config.passes and not _sweep(state).is_held:
         trajectory, position = append_swept(trajectory, config, position, choose)
     else:
-        target = SineTarget(before.frequency_hz, *choose(before.frequency_hz))
-        count = math.ceil(config.update_s(before.frequency_hz) * trajectory.rate_hz)
-        step = config.find_window(position.sweep, before.frequency_hz)
-        trajectory = trajectory.append_sweep(target, count, step, 0.0, Label.MEASURE)
+        trajectory, position = _append_stand(state, trajectory, position, choose)
     sweep = replace(_sweep(state), position=position)
     return replace(state, trajectory=trajectory, sweep=sweep)
+
+
+def _append_stand(
+    state: SequencerState,
+    trajectory: Trajectory,
+    position: SweptPosition,
+    choose_level: Callable[[float], tuple[float, float]],
+    min_s: float = 0.0,
+) -> tuple[Trajectory, SweptPosition]:
+    """Append a part at one frequency, or one in which the frequency comes to a stand."""
+    config, f, rate_1_s = _config(state), position.frequency_hz, trajectory.log_rate_1_s
+    step = config.find_window(position.sweep, f)
+    seconds = max(config.update_s(f), min_s)
+    if rate_1_s:
+        left = math.log(config.ends_hz(position.sweep)[1] / f)
+        seconds = min(seconds, 2.0 * left / rate_1_s)
+        f *= math.exp(0.5 * rate_1_s * seconds)
+    target = SineTarget(f, *choose_level(f))
+    count = math.ceil(seconds * trajectory.rate_hz)
+    label = Label.SETTLE if _sweep(state).is_held else Label.MEASURE
+    trajectory = trajectory.append_sweep(target, count, step, 0.0, label)
+    return trajectory, replace(position, frequency_hz=f)
+
+
+def hold_sweep(state: SequencerState, index: int) -> SequencerState:
+    """Bring the frequency to a stand behind sample `index`; unchanged if the drive ends before.
+
+    The level is controlled further.
+    """
+    trajectory, position = _go_on(state, index)
+    is_over = position.sweep >= _config(state).passes and not _sweep(state).until
+    if trajectory.end < index or is_over or _sweep(state).is_held:
+        return state
+    sweep = replace(_sweep(state), position=position, held_from=trajectory.end)
+    return _change_plan(replace(state, trajectory=trajectory, sweep=sweep))
+
+
+def resume_sweep(state: SequencerState, index: int) -> SequencerState:
+    """Go on behind sample `index`; a dwell gets the time that the hold took of it."""
+    held_from = _sweep(state).held_from
+    if held_from is None or state.stage.kind != "sweep":
+        return state
+    trajectory, position = _go_on(state, index)
+    until = _sweep(state).until
+    until += trajectory.end - held_from if until else 0
+    sweep = replace(_sweep(state), position=position, until=until, held_from=None)
+    return _change_plan(replace(state, trajectory=trajectory, sweep=sweep))
+
+
+def _change_plan(state: SequencerState) -> SequencerState:
+    """Plan again what is queued behind the trajectory; the next decision is made as before."""
+    trajectory = replace(state.trajectory, changed_from=state.trajectory.end)
+    state = replace(state.mark_queued(), trajectory=trajectory)
+    return replace(state, drive=_plan_ahead(state))
 
 
 def _approach_next_dwell(state: SequencerState) -> SequencerState:
@@ -176,21 +230,26 @@ def _approach_next_dwell(state: SequencerState) -> SequencerState:
 
 def _plan_ahead(state: SequencerState) -> Drive:
     """Return the drive that goes on with the last level and correction, then stops softly."""
-    config, position, trajectory = _config(state), _sweep(state).position, state.trajectory
     seconds = PREVIEW_LEADS * state.plan.rig.output.lead_s + NOMINAL_UPDATE_S
-    end = trajectory.end + math.ceil(seconds * trajectory.rate_hz)
+    end = state.trajectory.end + math.ceil(seconds * state.trajectory.rate_hz)
+    return _go_on(state, end)[0].to_drive(())
+
+
+def _go_on(state: SequencerState, end: int) -> tuple[Trajectory, SweptPosition]:
+    """Return trajectory and position that go on to sample `end`, but not beyond passes or dwell."""
+    config, position, trajectory = _config(state), _sweep(state).position, state.trajectory
     before = trajectory.target
     share = before.level_m_s2 / config.level_m_s2(before.frequency_hz)
 
     def hold(frequency_hz: float) -> tuple[float, float]:
         return share * config.level_m_s2(frequency_hz), before.correction
 
-    while position.sweep < config.passes and trajectory.end < end:
+    is_held = _sweep(state).is_held
+    while position.sweep < config.passes and trajectory.end < end and not is_held:
         trajectory, position = append_swept(trajectory, config, position, hold, NOMINAL_UPDATE_S)
-    if position.sweep >= config.passes and trajectory.end < min(end, _sweep(state).until):
-        step = config.find_window(position.sweep, position.frequency_hz)
-        trajectory = trajectory.append_hold(end - trajectory.end, step, Label.MEASURE)
-    return trajectory.to_drive(())
+    while trajectory.end < (end if is_held else min(end, _sweep(state).until)):
+        trajectory, position = _append_stand(state, trajectory, position, hold, NOMINAL_UPDATE_S)
+    return trajectory, position
 
 
 def _find_dwells(

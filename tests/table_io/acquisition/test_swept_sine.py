@@ -9,8 +9,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import hilbert
 
+from table_io.acquisition.session import OperatorCommand
 from table_io.block import Float1D, Label
+from table_io.clock import ManualClock
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
@@ -302,6 +305,62 @@ def test_dwell_at_the_resonance_found() -> None:
     assert dwell.sum() / 1000.0 == pytest.approx(6.0 + 2.0 * 2.0 / natural_hz, abs=1.6)
     assert cycles[-1].measured_m_s2 == pytest.approx(0.05 * GRAVITY_M_S2, rel=0.03)
     assert played.stop.verdict == "complete"
+
+
+def play_held(hold_s: float, resume_s: float, **sweep: Any) -> PlayedSession:
+    """Play a sweep that the operator holds and resumes at these times in s."""
+    clock = ManualClock()
+    orders = [(hold_s, "hold"), (resume_s, "resume")]
+
+    def operate() -> OperatorCommand | None:
+        if orders and clock.now() > orders[0][0]:
+            return OperatorCommand(orders.pop(0)[1], "operator")
+        return None
+
+    return play_session(make_swept_profile(**sweep), operate=operate, clock=clock)
+
+
+@pytest.mark.parametrize(("order", "hold_s"), [("forward", 27.5), ("backward", 24.0)])
+def test_held_sweep_stands_and_goes_on_at_its_rate(order: str, hold_s: float) -> None:
+    """The frequency moves for 10 s, from 25 or 22 s on."""
+    played = play_held(hold_s, hold_s + 8.0, directions=[order], octaves_per_min=9.0)
+    states = [event.text for event in played.select_events("state")]
+    assert states[-4:] == ["running", "holding", "running", "at rest"]
+    assert played.stop.verdict == "complete"
+    assert not played.select(Trip)
+    first, end = find_hold(played)
+    assert (end - first) / 1000.0 == pytest.approx(8.0, abs=1.5)
+    phase = np.unwrap(np.angle(hilbert(played.command_m[first:end])))[500:-500]
+    speed = np.diff(phase) / math.tau * 1000.0
+    assert np.abs(speed / np.median(speed) - 1.0).max() < 0.03
+    acceleration = np.diff(played.command_m[::4], 2) * 250.0**2
+    assert np.abs(acceleration).max() < 1.15 * 0.05 * GRAVITY_M_S2
+    hz, level, middle_s = measure_cycles(played, "table_acc_m_s2")
+    inside = (hz > 1.55) & (hz < 3.95)
+    assert np.abs(level[inside] / (0.05 * GRAVITY_M_S2) - 1.0).max() < 0.06
+    later = inside & (middle_s > end / 1000.0 + 1.5)
+    slope = np.polyfit(middle_s[later], np.log2(hz[later]), 1)[0]
+    assert 60.0 * abs(slope) == pytest.approx(9.0, rel=0.1)
+
+
+def test_held_dwell_gets_its_time_after_the_hold() -> None:
+    """The dwell begins at 43 s; what is measured in it lasts for its 5 s."""
+    dwelling = {"start_hz": 1.1, "stop_hz": 1.6, "dwell_s": 5.0, "octaves_per_min": 6.0}
+    played = play_held(44.0, 52.0, **dwelling)
+    dwell = played.block.step == played.block.step.max()
+    first, end = find_hold(played)
+    assert (end - first) / 1000.0 == pytest.approx(8.0, abs=1.5)
+    assert dwell[first]
+    assert (dwell & (played.block.label == Label.MEASURE)).sum() == pytest.approx(5000, abs=700)
+    assert played.stop.verdict == "complete"
+
+
+def find_hold(played: PlayedSession) -> tuple[int, int]:
+    """Return the samples (first, end) of the hold, behind the event that states it."""
+    (order,) = [e.index for e in played.select_events("state") if e.text == "holding"]
+    held = np.flatnonzero(played.block.label == Label.SETTLE)
+    held = held[held > order]
+    return int(held[0]), int(held[-1]) + 1
 
 
 def test_refusals_of_a_swept_sine_name_the_key() -> None:
