@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from table_io.config.shipped import list_shipped_names
 from table_io.errors import replace_escapes, require_package
 
 if TYPE_CHECKING:
@@ -27,8 +26,8 @@ class Speed(enum.StrEnum):
 
 
 def describe_names(text: str, kind: str) -> str:
-    """Return the help of an argument that takes a file or a name, with the shipped names."""
-    return f"{text}: a .toml file or a name: {', '.join(list_shipped_names(kind))}."
+    """Return the help of an argument that takes a file or a name of a kind."""
+    return f"{text}: a .toml file, or a name of `shaketwin list {kind}`."
 
 
 def complete_names(kind: str) -> Callable[[str], list[str]]:

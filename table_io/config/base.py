@@ -15,8 +15,15 @@ from typing import Annotated, Any, Self, TypeVar
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, ValidationError, ValidationInfo
 from pydantic.fields import FieldInfo
 
-from table_io.config.shipped import PROFILES_DIR as PROFILES_DIR  # noqa: PLC0414  exports it
 from table_io.errors import InputError, suggest
+
+# Folder of the shipped tests, rigs, models and campaigns. In a wheel the profiles lie inside the
+# package, in a source tree next to it.
+PROFILES_DIR = next(
+    folder / "profiles"
+    for folder in Path(__file__).resolve().parents[1:3]
+    if (folder / "profiles").is_dir()
+)
 
 # Strict: `true` or "0.05" in place of a number is a mistake, not a 1 or a 0.05.
 Number = Annotated[float, Field(strict=True)]

@@ -5,6 +5,7 @@ Each kind of outcome is seen once from a process of its own; the rest call `main
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -255,3 +256,21 @@ def test_check_moves_nothing_and_draws_the_drive(profile: Path, tmp_path: Path) 
 
 def test_no_monitor_no_view_where_nothing_runs() -> None:
     require_refusal(call_main("view", "--connect", "tcp/127.0.0.1:1"), "127.0.0.1:1")
+
+
+@pytest.mark.parametrize(
+    ("words", "remedy"),
+    [
+        (("control", "stopp"), "'stopp': did you mean 'stop'?"),
+        (("run", "g4_ss1", "--speed", "fast"), "'fast': known: realtime, max"),
+    ],
+)
+def test_wrong_word_is_answered_with_the_known_ones(words: tuple[str, ...], remedy: str) -> None:
+    require_refusal(call_main(*words), remedy)
+
+
+@pytest.mark.parametrize("name", ["run", "identify", "check"])
+def test_help_names_values_for_people(name: str) -> None:
+    text = call_main(name, "--help").stdout
+    assert "TEXT" in text
+    assert not re.search(r"<\w*(bool|str|path|list)", text)

@@ -7,6 +7,7 @@ write it there and add its row to `COMMANDS`.
 import ast
 import contextlib
 import os
+import re
 import sys
 from dataclasses import dataclass
 from functools import cache
@@ -16,11 +17,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, cast
 
 import typer
-from typer.core import TyperCommand, TyperGroup
+from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 from typer.main import get_command_from_info, get_group
 from typer.models import CommandInfo
 
-from table_io.errors import InputError
+from table_io.errors import InputError, suggest
 from twin.system.diagnostics import configure_logging
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
@@ -36,6 +37,36 @@ REFERENCE = "Reference"
 MARKUP: Literal["rich"] = "rich"
 FORMER_OPTIONS = {"--rig": "--table"}  # still accepted, not shown
 LIST_OPTIONS = ("--judge",)  # take all words up to the next option
+
+
+# What stands for a value in a help; a switch takes none.
+METAVARS = {"bool": "", "str": "TEXT", "int": "N", "float": "NUMBER", "Path": "PATH"}
+
+
+class WordCommand(TyperCommand):
+    """Command whose help names values for people, and that suggests a word for a wrong one."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return [_name_value(parameter) for parameter in super().get_params(ctx)]
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except typer.BadParameter as error:
+            error.message = error.message.removeprefix("Value error, ")
+            if " is not one of " in error.message:
+                word, *choices = re.findall(r"'(.*?)'", error.message)
+                error.message = f"{word!r}: {suggest(word, choices)}"
+            raise
+
+
+def _name_value(parameter: Any) -> Any:
+    """Return a parameter of which the help names the value as METAVARS do, once."""
+    if isinstance(parameter, TyperArgument):
+        parameter.display_type_rich = lambda **_: ""  # type: ignore[method-assign]
+    elif isinstance(parameter, TyperOption) and parameter.metavar is None:
+        parameter.metavar = METAVARS.get(parameter.bare_type())
+    return parameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +99,7 @@ class Command:
         lines = ["Examples:", *(f"shaketwin {words}" for words in EXAMPLES.get(self.name, ()))]
         info = CommandInfo(
             self.name,
+            cls=WordCommand,
             callback=declared,
             epilog="\n\n".join(lines) if self.name in EXAMPLES else None,
             hidden=self.hidden,
@@ -205,6 +237,9 @@ class CommandTable(TyperGroup):
             self.commands[row.name] = TyperCommand(
                 row.name, help=row.summary, hidden=row.hidden, rich_help_panel=row.panel
             )
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        return [_name_value(parameter) for parameter in super().get_params(ctx)]
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[Any, Any, list[str]]:
         """Return name and command that the first word names, and the words that it takes."""
