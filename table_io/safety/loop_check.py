@@ -50,13 +50,14 @@ NOISY = MOTION_CHANNELS + LOAD_CELLS
 
 MAX_LOST_PERCENT = 1.0  # of the samples
 MIN_NEW_PERCENT = 70.0  # of the samples: noise of two converter steps repeats 14 % of them
-MIN_STEPS_OF_CHANGE = 4.0  # usual change of a channel over its step, from which it repeats few
+MIN_STEPS_OF_CHANGE = 4.0  # change of a channel over its step, from which it repeats few
+MIN_LARGE_SHARE = 0.01  # of the samples, which change by so much: more than the tail of noise
 MIN_TONE_SNR = 10.0  # tone over its standard error
 DELAY_RANGE_MS = (-2.0, 100.0)
 MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
 MAX_READ_BACK_LSB, MAX_READ_BACK_RATIO = 4.0, 0.005  # DAC steps, and fraction of the command
 MIN_NOISE_MARGIN_DB = 20.0
-KNOWN_MARGIN_DB = 0.5  # by which noise may be more in a second of rest than the rig file states
+KNOWN_SIGMAS = 4.0  # by which the noise of a short rest may be more than that of the rig file
 MAX_OFFSET_RATIO = 0.05  # of the motion of the test, or of the gap
 # Of the motion of the test, and of the noise.
 MAX_RESIDUAL_MOTION_RATIO = 0.02
@@ -67,8 +68,6 @@ MAX_LEAD_SINE = -0.5
 # Tone of the mass: at least this in phase with the table, at most this in antiphase.
 MIN_IN_PHASE_TONE = 0.5
 MAX_ANTIPHASE_TONE = 0.9
-
-
 MIN_FLOOR_MOTION = 0.3  # of the table's tone, in what the laser of the mass reads
 
 
@@ -107,17 +106,20 @@ def check_alive(data: LoopCheckData) -> Iterator[Check]:
 def check_sample_rate(data: LoopCheckData) -> Iterator[Check]:
     """Check that a channel whose motion its converter resolves has a new value at every sample.
 
-    One that is sampled at a lower rate repeats each value; one that never changes is dead. The
-    step is the smallest change of a motion: a rig file may state more bits than the converter has.
+    One that is sampled at a lower rate repeats each value, and so changes by none after a large
+    change; a cell may rest between impacts. One that never changes is dead. The step is the
+    smallest change of a motion: a rig file may state more bits than the converter has.
     """
     windows = [data.window(hold) for hold in data.holds]
     for name in filter(data.has, NOISY):
         shares = []
         for window in windows:
             changes = np.abs(np.diff(window.channel(name)))
-            steps = changes[changes > 0.0]
-            if steps.size and np.median(steps) > MIN_STEPS_OF_CHANGE * float(steps.min()):
-                shares.append(100.0 * steps.size / changes.size)
+            is_new = changes > 0.0
+            step = float(changes[is_new].min(initial=math.inf))
+            is_large = changes[:-1] > MIN_STEPS_OF_CHANGE * step
+            if is_large.mean() > MIN_LARGE_SHARE:
+                shares.append(100.0 * float(is_new[1:][is_large].mean()))
         if shares:
             yield make_check(data, "new samples", name, min(shares), MIN_NEW_PERCENT, 100.0, "%")
 
@@ -318,25 +320,26 @@ def find_amplitude(profile: Profile, frequency_hz: float) -> float:
 def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
     """List what the loop check will refuse by what is known before: noise and converter steps.
 
-    By the noise that the rig file states. A sentence each, with the remedy.
+    By the noise that the rig file states, its converter's included, as the rest before the motion
+    may show it. A sentence each, with the remedy.
     """
     if not profile.loop_check.enabled:
         return []
+    rest_samples = profile.acquisition.rest_s * profile.acquisition.rate_hz
+    factor = 1.0 + KNOWN_SIGMAS / math.sqrt(2.0 * rest_samples)
 
     def noise(name: str) -> float:
         sensor = rig.sensor(name)
-        return max(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
+        return factor * math.hypot(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
 
     faults = [
-        f"noise of {name} is {value:.3g} {unit} +-{KNOWN_MARGIN_DB:g} dB by the rig file, allowed "
+        f"noise of {name} is {value:.3g} {unit} in a short rest by the rig file, allowed "
         + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
         + f" {unit}"
         for name, value, low, high, unit in list_noise_margins(
             profile, (name for name in NOISY if name in rig.channels), noise
         )
-        if not low + (KNOWN_MARGIN_DB if unit == "dB" else 0.0)
-        <= value
-        <= high * 10 ** (-(KNOWN_MARGIN_DB if unit == "N" else 0.0) / 20)
+        if not low <= value <= high
     ]
     targets = plan_targets(profile, rig)
     for name in TABLE_CHANNELS:
@@ -353,7 +356,7 @@ def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
             )
             for target in targets
         ]
-        if ratios and max(ratios) < MIN_TONE_SNR * 10 ** (KNOWN_MARGIN_DB / 20):
+        if ratios and max(ratios) < MIN_TONE_SNR:
             faults.append(
                 f"{name} is {max(ratios):.3g} times its noise in the loop check, allowed at least "
                 f"{MIN_TONE_SNR:g} times"

@@ -31,6 +31,7 @@ from table_io.safety.loop_check import (
     count_hold_cycles,
     evaluate,
     find_remedy,
+    list_known_faults,
     plan_targets,
     unwrap_phase,
 )
@@ -319,6 +320,32 @@ def test_converter_of_fewer_bits_than_stated_is_no_lower_rate(channel: str) -> N
     step = 1.5 * RIG.sensor(channel).noise_si
     coarse: Change = lambda values: step * np.round(values / step)  # noqa: E731
     assert ("new samples", channel) not in list_failures("g4_ss3", {channel: coarse})
+
+
+def test_cell_of_few_bits_that_rests_between_impacts_is_no_lower_rate() -> None:
+    """More than half of the values repeat, but few during the impacts, a fifth of the time."""
+    step = 8.0 * RIG.sensor("force_l1_n").noise_si
+
+    def strike(values: np.ndarray) -> np.ndarray:
+        impact = np.maximum(np.sin(np.arange(values.size) / 8.0) - 0.8, 0.0)
+        return step * np.round((values + 200.0 * step * impact) / step)
+
+    assert ("new samples", "force_l1_n") not in list_failures("g4_ss3", {"force_l1_n": strike})
+
+
+@pytest.mark.parametrize("bits", [12, 24])
+def test_known_noise_is_refused_with_that_of_its_converter_and_of_a_short_rest(bits: int) -> None:
+    profile = record_loop_check("g4_ss3")[0]
+    sensor = RIG.sensor("mass_acc_m_s2").model_copy(update={"bits": bits})
+    limit = profile.plan.level_m_s2 / math.sqrt(2.0) / 10.0  # 20 dB below the level
+    rest_samples = profile.acquisition.rest_s * profile.acquisition.rate_hz
+    limit /= 1.0 + 4.0 / math.sqrt(2.0 * rest_samples)
+    noise = math.sqrt(limit**2 - sensor.lsb_si**2 / 12.0) / sensor.si_per_unit
+    for factor, count in ((0.999, 0), (1.001, 1)):
+        noisy = sensor.model_copy(update={"noise_rms": factor * noise})
+        sensors = tuple(noisy if s.channel == noisy.channel else s for s in RIG.sensors)
+        rig = RIG.model_copy(update={"sensors": sensors})
+        assert len(list_known_faults(profile, rig)) == count
 
 
 @pytest.mark.parametrize("name", ["g4_ss3", "ginf", "gm1"])
