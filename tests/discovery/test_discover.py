@@ -36,6 +36,10 @@ from twin.discovery.units import assign_folds
 from twin.discovery.verdict import DiscoveryVerdict, closed_fraction, judge_selection
 from twin.laws.library import EFFECTS
 
+# What is left out where the library is not the subject: with the whole of it, it takes long.
+FEW = ("table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction")
+BUT_A_FEW = tuple(effect.id for effect in EFFECTS if effect.id not in FEW)
+
 
 @cache
 def discover(truth: str) -> Discovery:
@@ -59,7 +63,10 @@ def test_where_nothing_is_hidden_nothing_is_named() -> None:
             format_truth("maxwell_damper", k1=8e3, tau=0.05),
             EffectKey("maxwell_damper", "k1"), 8e3, marks=pytest.mark.slow,
         ),
-        (format_truth("gap_offset", offset=6e-4), EffectKey("gap_offset", "offset"), 6e-4),
+        pytest.param(
+            format_truth("gap_offset", offset=6e-4),
+            EffectKey("gap_offset", "offset"), 6e-4, marks=pytest.mark.slow,
+        ),
     ],
 )  # fmt: skip
 def test_an_effect_is_named_with_its_parameter(truth: str, key: EffectKey, value: float) -> None:
@@ -152,15 +159,13 @@ def test_a_misfit_in_the_few_samples_of_contact_is_not_noise() -> None:
 
 def test_a_bumper_is_judged_by_the_contact_rows_beside_a_dominant_effect() -> None:
     truth = format_truth("table_tilt", tilt=10.0) + format_truth("bumper_hardening", k2=3e7)
-    library = {"table_tilt", "bumper_hardening", "cubic_stiffness", "coulomb_friction"}
-    # with the whole library it takes a minute
-    without = [effect.id for effect in EFFECTS if effect.id not in library]
-    selection = discover_effects([log(truth, noise=20.0)], SNM, without=without).selection
+    selection = discover_effects([log(truth, noise=20.0)], SNM, without=BUT_A_FEW).selection
     assert {*selection.best.names} == {"table_tilt", "bumper_hardening"}
     null, tilted = selection.null.cost, selection.tried[0].cost
     assert tilted - selection.best.cost < 0.02 * (null - selection.best.cost)  # of all rows: minor
 
 
+@pytest.mark.slow  # 8 s
 def test_a_hysteresis_is_named_and_not_the_friction_that_is_nearest_to_it() -> None:
     truth = format_truth("bouc_wen", force=60.0, yield_displacement=1e-3, exponent=1.0, beta=0.5)
     verdict = discover_effects([log(truth)], SNM).verdict
@@ -238,7 +243,9 @@ def test_a_motion_without_steps_has_a_place_too() -> None:
     driven = [step.frequency_hz for step in prepared.steps]
     nowhere = np.full(prepared.signals.step.size, -1)
     discovery = discover_effects(
-        [PreparedLog(replace(prepared.signals, step=nowhere), prepared.contact_n)], SNM
+        [PreparedLog(replace(prepared.signals, step=nowhere), prepared.contact_n)],
+        SNM,
+        without=BUT_A_FEW,
     )
     assert discovery.localization.frequency_hz is not None
     low, high = discovery.localization.frequency_hz
@@ -340,7 +347,7 @@ def test_where_too_much_is_recorded_the_last_cycles_say_the_same(
     monkeypatch.setattr(
         "twin.discovery.residuals.MAX_SAMPLES", int(whole.motion().moving.sum()) // 2
     )
-    discovery = discover_effects([log(truth)], SNM)
+    discovery = discover_effects([log(truth)], SNM, without=BUT_A_FEW)
     (thin,) = discovery.prepared.problem.log_residuals
     assert thin.entry_row.size < 0.6 * whole.entry_row.size
     m = thin.motion()
@@ -380,6 +387,7 @@ def test_no_step_is_judged_by_a_fit_that_saw_it() -> None:
         assert np.unique(fold[held & (steps == number) & (fold >= 0)]).size == 1
 
 
+@pytest.mark.slow  # 10 s
 def test_the_oracle_is_not_far_better() -> None:
     prepared = log(format_truth("maxwell_damper", k1=8e3, tau=0.05))
     oracle = fit_known_effects([prepared], SNM, ["maxwell_damper"])
@@ -400,7 +408,7 @@ def test_whoever_has_enough_keeps_what_was_found() -> None:
             raise Cancelled
 
     truth = format_truth("bumper_hardening", k2=3e7) + format_truth("coulomb_friction", fc=30.0)
-    discovery = discover_effects([log(truth)], SNM, tell)
+    discovery = discover_effects([log(truth)], SNM, tell, BUT_A_FEW)
     assert not discovery.selection.complete
     best = reports[-1].best
     assert best is not None

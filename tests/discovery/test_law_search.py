@@ -163,6 +163,7 @@ def test_friction_behind_slack_is_distinguished_from_plain_hysteresis(monkeypatc
     assert values[EffectKey("law_constant_force", "k")] == pytest.approx(1.2e3, rel=0.05)
 
 
+@pytest.mark.slow  # 8 s
 def test_a_term_that_stood_in_for_another_is_dropped(monkeypatch):
     """A resonator on the table looks like one on the specimen, until it is fitted itself."""
     monkeypatch.setattr(law_search, "FIRST_REFITS", 1)

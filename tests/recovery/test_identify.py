@@ -180,6 +180,7 @@ def joint(noise: float, seed: int) -> FitResult:
     return fit_parameters(prepared.problem.log_residuals, prepared.parameters)
 
 
+@pytest.mark.slow  # 6 s
 def test_intervals_cover_the_truth_at_their_level() -> None:
     """A handful: 95 % of 30 are 28.5, fewer than 25 come once in three hundred times."""
     hits = [
