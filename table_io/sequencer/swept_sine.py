@@ -52,6 +52,10 @@ PREVIEW_LEADS = 3.0  # lead times of the queue that are planned ahead of a decis
 COMMAND_SHARE = 0.98  # of the limits of the rig that a corrected command may use
 MAX_RESONANCE_LAG = 0.2  # in ln f between the peaks of one resonance, up and down
 MAX_FORESEEN_CHANGE = 0.4  # in ln(ratio) from the last points on: beyond is a jump
+# Of a limit, up to which the level that the twin predicted is played. The twin aims at LIMIT_SHARE;
+# beside a jump the response hardly changes with the level, and to aim there too by what is measured
+# would take five per cent of the level for one of the response.
+FORESEEN_SHARE = 0.985
 KNOWN_SPAN = 0.3  # in ln f, of what an earlier pass says about the next part
 NOTCHED_SHARE = 0.998  # of the level of the profile: below it is reduced by a limit
 
@@ -355,9 +359,11 @@ def _limit_level(
         if points or levels.earlier:
             ln_f = math.log(frequency_hz)
             ratio = extrapolate_ratio(points, known, ln_f)
-            foreseen = _foresee_ratio(config, levels, entry.channel, points, ln_f)
-            ratio = foreseen if math.isfinite(foreseen) else ratio
-            share = min(share, LIMIT_SHARE * entry.limit_si / (math.exp(ratio) * reference))
+            foreseen = foresee_ratio(config, levels.sweep, entry.channel, points, ln_f)
+            aim = LIMIT_SHARE
+            if math.isfinite(foreseen):
+                ratio, aim = foreseen, FORESEEN_SHARE
+            share = min(share, aim * entry.limit_si / (math.exp(ratio) * reference))
     if config.predicted is not None:
         predicted = config.predicted.level_m_s2(levels.sweep, frequency_hz)
         share = min(share, predicted / reference) if math.isfinite(predicted) else share
@@ -368,9 +374,9 @@ def _limit_level(
     return reference * share
 
 
-def _foresee_ratio(
+def foresee_ratio(
     config: SweptSine,
-    levels: _PassLevels,
+    sweep: int,
     channel: str,
     points: list[tuple[float, float]],
     ln_f: float,
@@ -378,15 +384,18 @@ def _foresee_ratio(
     """Return ln of a channel over the level at ln f by the twin and the measured difference to it.
 
     NaN without a prediction, or where that jumps on the way: the specimen jumps at another place.
+    What was measured before a jump of the twin says nothing about its other branch.
     """
     if config.predicted is None or not points:
         return math.nan
 
-    predict = partial(config.predicted.log_ratio, levels.sweep, channel)
-    jumps = [abs(predict(ln_f) - predict(at)) for at, _ in points]
-    if not all(jump < MAX_FORESEEN_CHANGE for jump in jumps):
+    predict = partial(config.predicted.log_ratio, sweep, channel)
+    near = [
+        point for point in points if abs(predict(ln_f) - predict(point[0])) < MAX_FORESEEN_CHANGE
+    ]
+    if points[-1] not in near:
         return math.nan
-    return extrapolate_ratio(points, predict, ln_f)
+    return extrapolate_ratio(near, predict, ln_f)
 
 
 def _choose_correction(

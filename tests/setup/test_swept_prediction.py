@@ -1,13 +1,16 @@
 """Notch of a swept sine by the twin before the run: its limit kept, and the run close to it."""
 
 import math
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from table_io.config.base import PROFILES_DIR
+from table_io.config.excitation.swept_sine import PredictedSweep, SweptSine
 from table_io.records import SweepLevel
+from table_io.sequencer.swept_sine import foresee_ratio
 from tests.builders.sessions import play_session
 from twin.setup.run_config import RunConfig, read_run_config
 
@@ -75,3 +78,18 @@ def test_prediction_travels_with_the_profile_and_is_not_computed_again(config: R
     assert "prediction.csv" in config.profile_toml
     path = Path(PROFILES_DIR) / "tests" / "g10.toml"
     assert read_run_config(path).profile.swept_sine is None
+
+
+def test_points_before_a_jump_say_nothing_about_the_branch_behind_it() -> None:
+    """The twin jumps at 2 Hz from a ratio of 1 to 4; the specimen is 10 % above it behind."""
+    rows = [(0.0, 0.02 * k, 1.0, 1.0 if k < 100 else 4.0) for k in range(90, 121)]
+    predicted = PredictedSweep(("mass_acc_m_s2",), np.array(rows))
+    config = SweptSine(
+        start_hz=1.0, stop_hz=3.0, prediction="p.csv", files={"p.csv": predicted.to_csv()}
+    )
+    foresee = partial(foresee_ratio, config, 0, "mass_acc_m_s2")
+    before = [(math.log(hz), 0.0) for hz in (1.90, 1.92, 1.94, 1.96)]
+    behind = (math.log(2.02), math.log(4.4))
+    assert foresee([*before, behind], math.log(2.06)) == pytest.approx(math.log(4.4))
+    assert math.isnan(foresee(before, math.log(2.06)))
+    assert foresee(before, math.log(1.97)) == pytest.approx(0.0)
