@@ -1,8 +1,8 @@
 """Rows of text cells, of a text file or a sheet, as a table of numbers.
 
-An empty cell or "NaN" is a lost sample. A column whose first cell is text is no column of numbers;
-elsewhere a cell that is no number is an InputError with file, row and column. What stands below the
-samples and is none is left out.
+An empty cell, "NaN" or one of LOST_MARKS is a lost sample. A column whose first cell is text is no
+column of numbers; elsewhere a cell that is no number is an InputError with file, row and column.
+What stands below the samples and is none is left out.
 """
 
 from array import array
@@ -14,6 +14,7 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.errors import InputError
 from table_io.formats.layout import (
+    LOST_MARKS,
     ClockReader,
     TableLayout,
     is_number,
@@ -69,7 +70,7 @@ class _CellReader:
 
     def _parse_cell(self, k: int, text: str, number: int) -> float:
         """Return the number of a cell; NaN if it is empty, or in a column of text."""
-        if not text or k in self.texts:
+        if not text or text.lower() in LOST_MARKS or k in self.texts:
             return float("nan")
         try:
             return self._converters[k](text)

@@ -22,6 +22,12 @@ MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which ce
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 FORTRAN = re.compile(r"\s*[-+]?\d*\.?\d*[dD][-+]?\d+\s*")
 # With marks of thousands that cannot be decimal commas: 1,234.5 and 1'234.
+LOST_MARKS = {
+    "na", "n/a", "#n/a", "null", "-", "--", "---", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan",
+    "1.#ind", "-1.#ind",
+}  # fmt: skip
+# A minus sign, an apostrophe, and blanks that do not break, between thousands.
+PLAIN_MARKS = str.maketrans({"−": "-", "’": "'", "\u00a0": "'", "\u202f": "'", "\u2009": "'"})
 THOUSANDS = re.compile(r"\s*[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:'\d{3})+(?:\.\d*)?)\s*")
 ROW_WORDS = ("TS", "RN")  # units of a time stamp and of a row number, in loggers of Campbell
 # Line below the units of those loggers: how the samples of a column were reduced.
@@ -212,7 +218,7 @@ def _strip_end(row: Sequence[str]) -> Sequence[str]:
 def _find_kind(cell: str, commas: bool) -> str:
     """Return the kind of a cell: n number, c time of day, t text, or a blank if it is empty."""
     text = cell.strip()
-    if not text:
+    if not text or text.lower() in LOST_MARKS:
         return " "
     if is_number(text.replace(",", ".") if commas else text):
         return "n"
@@ -230,6 +236,7 @@ def is_number(cell: str) -> bool:
 
 def parse_number(cell: str) -> float:
     """Return the number of a cell, also 1.0D-03 of Fortran and 1,234.5; else ValueError."""
+    cell = cell if cell.isascii() else cell.strip().translate(PLAIN_MARKS)
     try:
         return float(cell)
     except ValueError:

@@ -7,6 +7,7 @@ and empty lines are no samples.
 
 import csv
 import re
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from itertools import chain, islice
@@ -15,13 +16,15 @@ from typing import TextIO
 
 from table_io.channels import CHANNEL_BY_NAME, TIME_COLUMN
 from table_io.errors import InputError
-from table_io.formats.cells import CellRow, make_width_error, read_cells
+from table_io.formats.cells import MAX_QUOTED_CHARS, CellRow, make_width_error, read_cells
 from table_io.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout, is_number
 from table_io.formats.table import ForeignTable, TableColumns
 
 BLANKS = " "  # one or more of them, or tabs
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 MAX_LINE_CHARS = 1_000_000
+COMPARED_ROWS = 8  # with the last one of a file that ends in no line feed
+DECIMALS = re.compile(r"\d\.(\d+)\s*$")
 
 
 def parse_table(file: TextIO, path: Path) -> ForeignTable:
@@ -127,6 +130,7 @@ def _check_header(layout: TableLayout, head: list[str], delimiter: str, path: Pa
 
 def _iter_lines(file: TextIO, path: Path) -> Iterator[str]:
     """Yield the lines of a file; raise InputError for one beyond MAX_LINE_CHARS."""
+    recent: deque[str] = deque(maxlen=COMPARED_ROWS)
     while line := file.readline(MAX_LINE_CHARS):
         if len(line) == MAX_LINE_CHARS:
             raise InputError(
@@ -134,7 +138,24 @@ def _iter_lines(file: TextIO, path: Path) -> Iterator[str]:
                 where=path,
                 remedy="give one row per sample",
             )
+        if line[-1:] not in "\r\n" and _is_cut_off(line, recent):
+            raise InputError(
+                f"its last row ends in {line[-MAX_QUOTED_CHARS:]!r}, with fewer digits than all "
+                "before: the file is cut off",
+                where=path,
+                remedy="export it again, or remove the last row",
+            )
+        recent.append(line)
         yield line
+
+
+def _is_cut_off(line: str, before: Iterable[str]) -> bool:
+    """Return True if a row has fewer decimals at its end than the rows before, which have alike."""
+    last, *counts = (
+        len(match[1]) if (match := DECIMALS.search(row)) else 0 for row in (line, *before)
+    )
+    is_alike = len(counts) == COMPARED_ROWS and len({*counts}) == 1
+    return is_alike and last < counts[0] and line[:1] in "+-.0123456789"
 
 
 def _parse_header(line: str, delimiter: str, path: Path) -> list[str]:

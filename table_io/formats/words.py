@@ -27,10 +27,13 @@ KNOWN_UNITS = {*UNITS, *TIME_UNITS, "Hz", "-"}
 AMBIGUOUS_ENDINGS = ("d", "h")  # of a name: "acc_d" is not in days
 MASS_UNITS_KG = {"kg": 1.0, "t": 1e3, "ton": 1e3, "tons": 1e3, "tonnes": 1e3, "lb": 0.45359237}
 FACT_NAMES = {
-    "rate_hz": (r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"),
+    "rate_hz": (
+        r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"
+        r"|samples[ _]*per[ _]*second|abtast(?:rate|frequenz)"
+    ),
     "interval_s": (
         r"(?:sampling|sample|scan|time)[ _]*(?:interval|period|step|increment)(?:_s)?|dt|ts"
-        r"|delta_?t"
+        r"|delta[ _]?t"
     ),
     "mass_kg": r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg",
 }
@@ -71,9 +74,17 @@ def is_unit(text: str) -> bool:
 
 
 def find_unit(name: str) -> str:
-    """Return the unit that a column name states in brackets at its end, as "load [kN]", or ""."""
+    """Return the unit at the end of a column name, as "load [kN]", "load/kN" or "load in kN"."""
+    text = find_bracketed(name)
+    if not text and (match := re.fullmatch(r"(.*\w)(?:\s*/\s*| in )([^/\s]+)", name.strip())):
+        text = "" if is_unit(split_words(match[1])[-1]) else match[2]  # m/s is one unit
+    return normalize_unit(text) if is_unit(text) else ""
+
+
+def find_bracketed(name: str) -> str:
+    """Return what stands in brackets at the end of a column name, or ""."""
     match = re.search(r"[(\[]([^()\[\]]+)[)\]][\s:]*$", name)
-    return normalize_unit(match[1]) if match and is_unit(match[1]) else ""
+    return match[1].strip() if match else ""
 
 
 def find_stated_unit(name: str, unit: str = "") -> str:

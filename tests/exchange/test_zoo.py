@@ -217,6 +217,26 @@ GOOD: dict[str, str | bytes] = {
     "lost_nan.csv": text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "NaN"),
     "fortran.dat": text("Time[s] Disp[mm] Force[N]", mark="  ", digits="{:.9E}").replace("E", "D")
     .replace("Disp", "Disp"),
+    "din_slash.csv": text("t/s,Weg/mm,Kraft/N"),
+    "in_unit.csv": text("Zeit in s;Weg in mm;Kraft in N", mark=";"),
+    "french_thousands.csv": "\n".join(
+        ["Temps (s);Déplacement (µm);Effort (N)"]
+        + [f"{t:.4f};{1e3 * u:,.4f};{f:.7f}".replace(",", "\u202f").replace(".", ",")
+           for t, u, f in ROWS]
+    ),
+    "unicode_minus.csv": text("Time (s),Disp (mm),Force (N)").replace("-", "−"),
+    "lost_excel.csv": text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "#N/A"),
+    "lost_qnan.csv": text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "1.#QNAN"),
+    "waveform.txt": text(
+        "waveform\t[0]\t[1]\nt0\t28.03.2026 23:59:59.5\t28.03.2026 23:59:59.5\n"
+        "delta t\t0.005000\t0.005000\n\nDisp (mm)\tForce (N)", ((u, f) for _, u, f in ROWS),
+        mark="\t",
+    ),
+    "per_second.csv": text(
+        "Samples per second,200\nDisp (mm),Force (N)", ((u, f) for _, u, f in ROWS)
+    ),
+    "no_line_feed.csv": text("Time (s),Disp (mm),Force (N)").rstrip(),
+    "footer_no_line_feed.csv": text("Time (s),Disp (mm),Force (N)", tail="End"),
     "one.lvm": lvm("One"), "no.lvm": lvm("No"), "multi.lvm": lvm("Multi"),
     "comma.lvm": lvm("One", mark=","), "decimal.lvm": lvm("One", decimal=","),
     "segments.lvm": lvm("One", segments=3), "segments_no.lvm": lvm("No", segments=2),
@@ -251,6 +271,9 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "overflow.csv": (
         text("Time (s),Disp (mm),Force (N)").replace(f"{FORCE_N[9]:.7f}", "OVERFLOW"), "OVERFLOW"
     ),
+    "cut_off.csv": (text("Time (s),Disp (mm),Force (N)")[:-9], "cut off"),
+    "unknown_unit.csv": (with_scales("Time (s),Disp (mil),Force (N)", 39.37, 1.0), "'mil'"),
+    "unknown_force.csv": (with_scales("Time (s),Disp (mm),Force (daN)", 1.0, 0.1), "'daN'"),
     "backwards.csv": (text("Time (s),Disp (mm),Force (N)", reversed(ROWS)), "time"),
     "twice.csv": (text("Time (s),Disp (mm),Force (N)", [*ROWS, *ROWS]), "time must rise"),
     "two_clocks.csv": (

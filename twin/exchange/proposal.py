@@ -24,6 +24,7 @@ from table_io.formats.timing import (
     judge_time_unit,
 )
 from table_io.formats.words import (
+    find_bracketed,
     find_quantity,
     find_stated_unit,
     matches_words,
@@ -284,6 +285,11 @@ def _propose_unit(
         return stated, "stated in the file", ""
     if stated in UNITS and UNITS[stated][0] == "V":
         return "", "in volts", f"column {name!r} is in volts: state its gain in the map, SI per V"
+    text = find_bracketed(name)
+    if text.isalpha() and not any(matches_words([text.lower()], w) for w in BODY_WORDS.values()):
+        return "", "", (
+            f"column {name!r}: its unit {text!r} is not known; state one of {', '.join(allowed)}"
+        )  # fmt: skip
     if known.recorded_unit(channel) not in ("m", "m/s2"):
         return "", "", (
             f"column {name!r}: its unit is not stated; state one of {', '.join(allowed)}"

@@ -132,7 +132,7 @@ def test_rows_between_which_lines_are_left_out_keep_their_numbers(tmp_path: Path
         ("a;b\n1;2,5\n3;4,5\n" + "5;6\n" * 300 + "7;8.5\n", ["row 304", "'8.5'"]),
         ("a,b\ns,mm\n1,2\nx,3\n", ["row 4", "column 'a'", "'x'"]),
         ("t u\n0 1\n1 2\n2 3 4\n", ["row 4", "3 cells", "2 columns"]),
-        ("a,b\n1,2\n3,N/A\n", ["row 3", "column 'b'", "leave a lost sample empty"]),
+        ("a,b\n1,2\n3,lost\n", ["row 3", "column 'b'", "leave a lost sample empty"]),
         ("a,b\n1,2\nend\n3,4\n", ["row 3 has 1 cells"]),
         ('a,b\n1,"2\n' + "3,4\n" * 50_000, ["row 2", "quote"]),
         ("a,b\n" + "1" * (MAX_LINE_CHARS + 5), ["line of more than"]),
