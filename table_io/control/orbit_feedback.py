@@ -8,9 +8,10 @@ command answers it a fixed horizon later, so a sine-like deviation is answered a
 
 Every block gives such a function. It replaces the previous one by a quintic blend, so the command
 stays C2, and it fades to zero if no later block replaces it. The amplitude of the correction is
-limited, and so is the acceleration of what is written, whether it comes from a deviation, from the
-share or from a fade: the blend to the next function is as long as that needs, and beyond the
-longest one a block replaces only a part of the previous function.
+limited, and so is the acceleration of the command with it: what would raise the held command is
+cut, what turns or lowers it is not. Whether it comes from a deviation, from the share or from a
+fade, the blend to the next function is as long as that needs, and beyond the longest one a block
+replaces only a part of the previous function.
 
 Why x and not u = x - y: at frequencies above its resonance the mass stands still, so u = -y returns
 the correction at a gain of about -g with the delay of the loop, which is close to instability.
@@ -32,6 +33,10 @@ BLEND_S = 0.02  # from the previous function to the next
 BLEND_FACTORS = (1.0, 1.5, 2.25, 3.5, 5.0)  # on it: the first that the acceleration allows
 PREDICTION_S = 0.05  # after the horizon, until the function fades if no block replaces it
 FADE_S = 0.15
+# Acceleration of command and feedback over that of the held command. Orbits are held at 1.12 too,
+# but there a departure is caught too slowly to state multipliers.
+MAX_COMMAND_RATIO = 1.3
+STEADY_SHARE = 0.98  # of that acceleration for a steady correction: the rest is for its changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +56,7 @@ class ReferenceSegment:
     gain: float
     rate_gain_s: float
     limit_m: float  # amplitude of the correction
-    max_acceleration_m_s2: float  # of the correction as it is written
+    max_acceleration_m_s2: float  # of the command as it is written, the correction included
 
     def share(self, indices: Int1D) -> Float1D:
         """Return the share at sample indices, (sample,)."""
@@ -129,25 +134,30 @@ def advance_feedback(
     if not w or deviation.size < window or not np.isfinite(deviation).all():
         return state, drive.correction, start
     rotation = np.exp(1j * w * np.arange(-window, 0) / rate_hz)
-    phasor = complex(segment.gain, w * segment.rate_gain_s) * _fit_phasor(deviation, rotation)
-    is_saturated = abs(phasor) > segment.limit_m
-    if is_saturated:
-        phasor *= segment.limit_m / abs(phasor)
+    count = round((PREDICTION_S + FADE_S) * rate_hz) + max(start - end - state.horizon, 0)
+    # Two samples before and after, so that every second difference that changes is among these.
+    command = drive.command(start - 2, count + 4)
+    previous = drive.correction.displacement(start - 2, count + 4)
+    indices = np.arange(start, start + count)
+    turns = np.exp(1j * w * (indices - end - state.horizon) / rate_hz)
+    sought = complex(segment.gain, w * segment.rate_gain_s) * _fit_phasor(deviation, rotation)
+    phasor = sought * min(1.0, segment.limit_m / max(abs(sought), segment.limit_m))
+    nominal = _fit_phasor((command - previous)[2 : window + 2], turns[:window])
+    radius = STEADY_SHARE * segment.max_acceleration_m_s2 / w**2
+    if abs(nominal + phasor) > max(radius, abs(nominal)):
+        phasor = (nominal + phasor) * max(radius, abs(nominal)) / abs(nominal + phasor) - nominal
+    is_saturated = phasor != sought
     saturated = state.saturated_samples + end - state.index if is_saturated else 0
     state = replace(state, index=end, saturated_samples=saturated)
-    count = round((PREDICTION_S + FADE_S) * rate_hz) + max(start - end - state.horizon, 0)
-    indices = np.arange(start, start + count)
-    values = np.real(phasor * np.exp(1j * w * (indices - end - state.horizon) / rate_hz)) * (
+    values = np.real(phasor * turns) * (
         1.0 - smoothstep((indices - indices[-1]) / (FADE_S * rate_hz) + 1.0)
     )
     values *= segment.share(indices)
-    # Two samples before and after, so that every second difference that changes is among these.
-    previous = drive.correction.displacement(start - 2, count + 4)
     difference = np.pad(values - previous[2:-2], 2)
     limit = segment.max_acceleration_m_s2 / rate_hz**2
     for factor in BLEND_FACTORS:
         blend = smoothstep(np.arange(-2, count + 2) / (factor * BLEND_S * rate_hz))
-        share = _limit_change(previous, difference * blend, limit)
+        share = _limit_change(command, difference * blend, limit)
         if share == 1.0:
             break
     values = (previous + share * difference * blend)[2:-2]

@@ -13,6 +13,7 @@ from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
+from table_io.control.orbit_feedback import MAX_COMMAND_RATIO
 from table_io.control.order_tracking import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, HistorySegment, Segment, envelope_acceleration
@@ -143,20 +144,17 @@ def _add_feedback(
 ) -> tuple[float, float, float]:
     """Return the bounds of (displacement, velocity, acceleration) with a feedback, SI.
 
-    The feedback c is added in any phase. Its amplitude and its acceleration are limited to a share
-    of the held step (`control/orbit_feedback.py`); |c'| <= sqrt(2 max|c| max|c''|) for any motion
-    that begins and ends at rest. A decay g of both, from anywhere, has (g c)'' too.
+    The amplitude of the feedback is limited to a share of the held step, and the acceleration of
+    both together (`control/orbit_feedback.py`). |q'| <= sqrt(2 max|q| max|q''|) for any motion that
+    begins and ends at rest. A stop multiplies both, which are close to a sine, by its decay.
     """
-    d, v, a = (share * peak for peak in _steady_peaks(step))
-    stop = Segment(0, 1, Label.STOP, step.index, step.frequency_hz, step.frequency_hz,
-                   step.acceleration_m_s2, 0.0, 0.0)  # fmt: skip
-    x = np.linspace(0.0, 1.0, 401)
-    seconds = stop.decay_samples(0.0, rate_hz) / rate_hz
-    slope = 30.0 * x**2 * (1.0 - x) ** 2 / seconds
-    curvature = 60.0 * np.abs(x * (1.0 - x) * (1.0 - 2.0 * x)) / seconds**2
-    decaying = a * (1.0 - smoothstep(x)) + 2.0 * slope * math.sqrt(2.0 * a * d) + curvature * d
-    decaying += envelope_acceleration(replace(stop, count=round(seconds * rate_hz)), x, rate_hz)
-    return (peaks[0] + d, peaks[1] + math.sqrt(2.0) * v, max(peaks[2] + a, float(decaying.max())))
+    d, _, a = _steady_peaks(step)
+    stop = Segment(0, 1, Label.STOP, step.index, step.frequency_hz, step.frequency_hz, a, 0.0, 0.0)
+    stop = replace(stop, count=stop.decay_samples(0.0, rate_hz))
+    decaying = envelope_acceleration(stop, np.linspace(0.0, 1.0, 401), rate_hz)
+    displacement, acceleration = peaks[0] + share * d, MAX_COMMAND_RATIO * float(decaying.max())
+    velocity = math.sqrt(2.0 * displacement * acceleration)
+    return (displacement, velocity, max(peaks[2], acceleration))
 
 
 def _history_demands(

@@ -40,7 +40,12 @@ from table_io.config.excitation.continuation import (
     pack_harmonics,
     unpack_harmonics,
 )
-from table_io.control.orbit_feedback import FeedbackState, ReferenceSegment, advance_feedback
+from table_io.control.orbit_feedback import (
+    MAX_COMMAND_RATIO,
+    FeedbackState,
+    ReferenceSegment,
+    advance_feedback,
+)
 from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
 from table_io.excitation.trajectory import SineTarget, Trajectory
 from table_io.records import Event, FrequencyResponse, OrbitPoint
@@ -227,7 +232,7 @@ def _append_orbit(
         orbit.gain,
         orbit.rate_gain_s,
         config.max_feedback * command_m,
-        config.max_feedback * sine.corrected_m_s2,
+        MAX_COMMAND_RATIO * sine.corrected_m_s2,
     )
     return trajectory, feedback.append(segment)
 

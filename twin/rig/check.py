@@ -220,8 +220,8 @@ def _orbit_lines(config: Continuation, peak_g: float) -> list[tuple[str, str]]:
         ),
         (
             "feedback",
-            f"at most {100 * config.max_feedback:g} % of the command and of its acceleration, "
-            f"never above {peak_g:.4g} g with it, stops included; planned for a latency of "
+            f"at most {100 * config.max_feedback:g} % of the amplitude of the command, which "
+            f"stays below {peak_g:.4g} g with it, stops included; planned for a latency of "
             f"{1e3 * plan.latency_s:.3g} ms and {1e3 * plan.jitter_s:.3g} ms of jitter",
         ),
         ("level", f"{extent}{max(levels_g):.4g} g peak table acceleration"),

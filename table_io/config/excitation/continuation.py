@@ -207,7 +207,7 @@ class Continuation(Excitation):
         0.5,
         gt=0,
         le=1.0,
-        description="Largest feedback over the command: in amplitude, and in acceleration.",
+        description="Largest amplitude of the feedback over that of the command.",
     )
     multiplier_periods: Count = Field(
         24,

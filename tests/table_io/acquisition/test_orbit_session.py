@@ -126,7 +126,7 @@ def find_stated_peak(held: PlayedSession) -> float:
     profile = make_profile()
     drive = procedure.nominal_drive(procedure.make_test_plan(profile, RIG, 40))
     stated = max(row.acceleration_m_s2 for row in compute_demands(drive, profile, RIG))
-    assert stated < 1.6 * 0.49033
+    assert stated <= 1.33 * 0.49033
     correction = max(
         p.command_m * (math.tau * p.frequency_hz) ** 2 for p in held.select(OrbitPoint)
     )
@@ -136,7 +136,7 @@ def find_stated_peak(held: PlayedSession) -> float:
 def test_command_stays_below_the_peak_that_the_check_states_and_ends_at_rest(
     held: PlayedSession,
 ) -> None:
-    assert 1.1 * 0.49 < measure_peak_acceleration(held.command_m) < find_stated_peak(held)
+    assert 1.05 * 0.49 < measure_peak_acceleration(held.command_m) < find_stated_peak(held)
     assert np.abs(held.command_m[-200:]).max() < 1e-6
 
 
@@ -150,7 +150,7 @@ def test_stop_at_any_moment_of_hold_and_release_stays_below_the_stated_peak(
     for at in range(round(20.0 * RATE_HZ), held.command_m.size - 5000, 211):
         part = held.command_m[at - 300 : at + 3000] * np.append(np.ones(300), decay)
         worst = max(worst, measure_peak_acceleration(part))
-    assert 1.1 * 0.49 < worst < stated
+    assert 1.05 * 0.49 < worst < stated
 
 
 def test_run_is_reproduced_to_the_bit(held: PlayedSession) -> None:

@@ -29,8 +29,15 @@ def make_drive() -> Drive:
 
 
 def make_state(**changes: Any) -> FeedbackState:
-    segment = ReferenceSegment(0, 1, REFERENCE, REFERENCE, 1.0, 1.0, GAIN, RATE_GAIN_S, 5e-4, LEVEL)
+    """Return a feedback whose acceleration is not limited, but by the changes."""
+    segment = ReferenceSegment(
+        0, 1, REFERENCE, REFERENCE, 1.0, 1.0, GAIN, RATE_GAIN_S, 5e-4, 9.0 * LEVEL
+    )
     return FeedbackState(HORIZON).append(replace(segment, **changes))
+
+
+def find_peak_m_s2(drive: Drive, first: int, count: int) -> float:
+    return float(np.abs(np.diff(drive.command(first, count), 2)).max() * RATE_HZ**2)
 
 
 def run_feedback(
@@ -77,12 +84,24 @@ def test_orbit_without_deviation_gets_no_correction() -> None:
     assert np.abs(drive.correction.values_m).max() < 1e-15
 
 
-def test_correction_stays_within_its_amplitude_and_acceleration() -> None:
-    state, drive = run_feedback(make_state(), sine(5e-3))
-    values = drive.correction.values_m
-    assert np.abs(values).max() <= 1.001 * 5e-4
-    assert 0.5 * LEVEL < np.abs(np.diff(values, 2)).max() * RATE_HZ**2 <= LEVEL * (1 + 1e-9)
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_correction_stays_within_its_amplitude_and_the_acceleration_of_the_command(
+    sign: float,
+) -> None:
+    state, drive = run_feedback(make_state(max_acceleration_m_s2=1.12 * LEVEL), sine(sign * 5e-3))
+    assert 1e-4 < np.abs(drive.correction.values_m).max() <= 1.001 * 5e-4
+    assert LEVEL * 0.99 < find_peak_m_s2(drive, 4000, 2050) <= 1.12 * LEVEL * (1 + 1e-9)
     assert state.saturated_samples > 1500
+
+
+def test_correction_that_lowers_the_command_is_not_limited_by_its_acceleration() -> None:
+    lower, phase = make_state(max_acceleration_m_s2=LEVEL), make_drive().phase(4000, 2000)
+    command_m = -LEVEL / (math.tau * F) ** 2 * np.sin(math.tau * phase)
+    answers = [run_feedback(lower, sign * 0.3 * np.roll(command_m, HORIZON))[1] for sign in (1, -1)]
+    raising, lowering = (
+        np.abs(drive.correction.displacement(5000, 900)).max() for drive in answers
+    )
+    assert lowering > 0.2 * np.abs(command_m).max() > 2.0 * raising
 
 
 @pytest.mark.parametrize("ramp_s", [0.0, 0.03, 0.05, 0.1])
@@ -92,7 +111,7 @@ def test_acceleration_of_the_written_correction_is_limited_in_any_ramp_of_the_sh
 ) -> None:
     """The share begins and ends at once or within a ramp, again and again, under a deviation."""
     rng = np.random.default_rng(seed)
-    state, count = make_state(max_acceleration_m_s2=0.1 * LEVEL), round(ramp_s * RATE_HZ)
+    state, count = make_state(max_acceleration_m_s2=1.02 * LEVEL), round(ramp_s * RATE_HZ)
     for k, start in enumerate(range(4200, 6000, 300)):
         before, after = float((k + 1) % 2), float(k % 2)
         state = state.append(
@@ -105,14 +124,13 @@ def test_acceleration_of_the_written_correction_is_limited_in_any_ramp_of_the_sh
             state, drives[-1] if drives else make_drive(), deviation, end
         )
         drives.append(drive)
-    played = [drive.correction.displacement(4000 + end + HORIZON - 2, BLOCK + 2)
-              for end, drive in zip(range(BLOCK, 2000, BLOCK), drives, strict=True)]  # fmt: skip
-    peaks = [np.abs(np.diff(values, 2)).max() * RATE_HZ**2 for values in played]
-    assert 0.09 * LEVEL < max(peaks) <= 0.1 * LEVEL * (1 + 1e-9)
+    peaks = [find_peak_m_s2(drive, 4000 + end + HORIZON - 2, BLOCK + 2)
+             for end, drive in zip(range(BLOCK, 2000, BLOCK), drives, strict=True)]  # fmt: skip
+    assert 1.01 * LEVEL < max(peaks) <= 1.02 * LEVEL * (1 + 1e-9)
 
 
 def test_correction_follows_a_share_that_ends_although_its_acceleration_is_limited() -> None:
-    state = make_state(max_acceleration_m_s2=0.1 * LEVEL)
+    state = make_state(max_acceleration_m_s2=1.02 * LEVEL)
     state = state.append(replace(state.segments[0], start=5000, count=60, share1=0.0))
     _, drive = run_feedback(state, sine(1e-4))
     before, after = (drive.correction.displacement(first, 300) for first in (4600, 5400))
@@ -141,7 +159,7 @@ def test_lost_samples_leave_the_queued_correction_as_it_is() -> None:
 
 
 def test_late_block_changes_only_what_can_still_be_changed() -> None:
-    state, drive = run_feedback(make_state(), sine(1e-4))
+    state, drive = run_feedback(make_state(max_acceleration_m_s2=3.0 * LEVEL), sine(1e-4))
     x = evaluate_harmonics(REFERENCE, drive.phase(6000, BLOCK)) + 3e-4
     _, correction, first = advance_feedback(state, drive, 6000, x, 6200, 0)
     assert first == 6200

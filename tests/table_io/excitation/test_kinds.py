@@ -165,8 +165,10 @@ def test_demands_cover_command_and_stop(kind: str) -> None:
     demands = [(row.displacement_m, row.velocity_m_s, row.acceleration_m_s2) for row in rows]
     played = [row for row, demand in zip(demands, rows, strict=True) if demand.name != "a stop"]
     continuation = profile(kind).continuation
-    share = 0.0 if continuation is None else continuation.max_feedback
-    feedback = 1.0 + share * np.array([1.0, math.sqrt(2.0), 1.0])  # |c'|^2 <= 2 |c| |c''|
+    feedback = np.ones(3)
+    if continuation is not None:  # |q'|^2 <= 2 |q| |q''|
+        d, a = 1.0 + continuation.max_feedback, 1.3
+        feedback = np.array([d, math.sqrt(2.0 * d * a), a])
     assert np.max(played, axis=0) == pytest.approx(feedback * own, rel=0.06)
     if rows[-1].direction == "a stop":
         stops = [
