@@ -124,7 +124,7 @@ EFFECTS: dict[str, tuple[str, dict[str, float]]] = {
     "bumper_maxwell": ("g4", {"kb": 6e4, "tau_b": 0.02}),
     "bumper_asymmetry": ("g4", {"kr": 580e3}),
     "gap_drift": ("g4", {"wear": 5e-6}),
-    "table_tilt": ("g10", {"tilt": 0.05}),
+    "table_tilt": ("g10", {"tilt": 0.2}),
 }
 
 
