@@ -18,10 +18,10 @@ from twin.discovery.command import parse_options, run_decision, run_discovery
 from twin.discovery.decisive_test import DecideOptions
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.system import terminal
+from twin.system.exit_codes import EXIT_INTERRUPTED
 
 PROFILE = """
 title = "one frequency"

@@ -26,9 +26,9 @@ from twin.discovery.words import format_verdict
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_model_template, read_run_config
 from twin.setup.unpaced import play_unpaced
+from twin.system.exit_codes import EXIT_INTERRUPTED
 
 PROFILE = """
 title = "short"

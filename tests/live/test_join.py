@@ -17,9 +17,9 @@ from tests.input_errors import raises_input_error
 from twin.live import join
 from twin.live.join import join_as_recorder
 from twin.recording.recovery import recover_log
-from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.security.access_control import build_open_access
 from twin.setup.run_config import read_run_config
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import PUBLIC_HUB_SETTINGS, merge_settings
 from twin.transport.reliable_subscriber import ReliableSubscriber

@@ -15,9 +15,9 @@ from tests.input_errors import raises_input_error
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.replay.command import ReplayRequest, replay_logs
-from twin.report.finalize import EXIT_NOT_IDENTICAL
 from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.unpaced import play_unpaced
+from twin.system.exit_codes import EXIT_NOT_IDENTICAL
 
 
 @pytest.fixture(scope="module")

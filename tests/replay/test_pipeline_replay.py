@@ -32,9 +32,9 @@ from twin.recording.tabular import parse_step_range
 from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
 from twin.replay.task import describe_replay
-from twin.report.finalize import EXIT_NOT_IDENTICAL
 from twin.results.contracts import ReplayResult
 from twin.setup.run_config import RunConfig
+from twin.system.exit_codes import EXIT_NOT_IDENTICAL
 from twin.transport.codec import Item, encode_item
 
 

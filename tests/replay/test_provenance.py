@@ -15,9 +15,9 @@ from twin.replay.command import ReplayRequest, replay_logs
 from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
 from twin.replay.task import describe_replay
 from twin.replay.verify import ReplayOutlook, examine_logs, verify_logs
-from twin.report.finalize import EXIT_ABORTED, EXIT_NOT_IDENTICAL
 from twin.results.contracts import ReplayResult
 from twin.setup.run_config import RunConfig
+from twin.system.exit_codes import EXIT_ABORTED, EXIT_NOT_IDENTICAL
 from twin.system.versions import read_installed_versions
 from twin.transport.codec import Item
 

@@ -23,12 +23,12 @@ from twin.inspection.folder_report import write_folder_report
 from twin.laws.effect import Effect, EffectParameter
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.run_config import read_model
 from twin.simulation.command import simulate_profile
 from twin.studies import figures
 from twin.studies.batch import parse_gaps_mm
 from twin.studies.result import COLUMNS, SweepSummary, read_batch_rows
+from twin.system.exit_codes import EXIT_INTERRUPTED
 
 pytestmark = pytest.mark.usefixtures("forget_entry_points")
 

@@ -1,7 +1,7 @@
 """`fleet`: call the task, print what came of it."""
 
 from twin.archive.fleet import TABLE_FILE, FleetOptions, run_fleet
-from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.system.grid import watch_on_terminal
 from twin.system.terminal import print_line
 

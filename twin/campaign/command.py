@@ -23,13 +23,13 @@ from twin.campaign.state import (
     hold_lock,
     resume_campaign,
 )
-from twin.report.finalize import EXIT_GAPS
 from twin.security.credentials import Credentials
 from twin.setup.disk import require_disk_space
 from twin.setup.folders import RUNS_FOLDER, make_output_folder
 from twin.setup.realtime import check_full_speed, check_realtime
 from twin.setup.run_config import RunConfig, make_run_id
 from twin.setup.warm_up import compile_kernels
+from twin.system.exit_codes import EXIT_GAPS
 from twin.system.terminal import print_line, show_status
 
 

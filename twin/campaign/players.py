@@ -32,8 +32,8 @@ from twin.campaign.state import ActiveCampaign, OperatorAnswer, write_summary_an
 from twin.live.process_config import ProcessConfig
 from twin.live.supervisor import Supervisor
 from twin.recording.merge import merge_run_parts
-from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.security.credentials import Credentials, credentials_folder
+from twin.system.exit_codes import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.system.files import count_cores
 from twin.system.progress import RunProgress
 from twin.system.terminal import catch_interrupts, console, print_line

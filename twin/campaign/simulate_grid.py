@@ -28,13 +28,13 @@ from twin.campaign.report import SYMBOLS, embed_pairs, list_gap_tables
 from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.drawing.page import write_page
 from twin.model.valid_range import EVENT_KIND
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.contracts import MotionResult, PeakAndRms, RunInfo, RunSummary, WindowResult
 from twin.results.windows import extract_free_twin
 from twin.setup.folders import make_run_folder
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import generate_ideal_twin
 from twin.setup.warm_up import compile_kernels
+from twin.system.exit_codes import EXIT_INTERRUPTED
 from twin.system.grid import Watch, run_grid, watch_on_terminal
 from twin.system.process_pool import Workers
 from twin.system.terminal import print_line, show_status

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from table_io.errors import InputError
+from twin.system.exit_codes import EXIT_FAILED
 from twin.system.resource_limits import MIN_MEMORY_BYTES, require_memory
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
@@ -29,11 +30,11 @@ def main() -> None:
         code = end.code
     except MemoryError:
         print(f"shaketwin: {NO_MEMORY_MESSAGE}", file=sys.stderr)
-        code = 2
+        code = EXIT_FAILED
     failures = [stream.failure for stream in streams if stream.failure]
     if failures and not code:
         print(f"shaketwin: cannot write the output: {failures[0]}", file=sys.stderr)
-        code = 2
+        code = EXIT_FAILED
     raise SystemExit(code)
 
 
@@ -45,7 +46,7 @@ def run_words(words: Sequence[str]) -> None:
             require_memory(MIN_MEMORY_BYTES)
     except InputError as error:
         print(f"shaketwin: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        raise SystemExit(EXIT_FAILED) from None
     if not was_order:
         from twin.cli.table import main as run_command_line
 

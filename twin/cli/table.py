@@ -23,6 +23,7 @@ from typer.models import CommandInfo
 
 from table_io.errors import InputError, suggest
 from twin.system.diagnostics import configure_logging
+from twin.system.exit_codes import EXIT_FAILED
 
 # The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
 # Set before numpy is imported; child processes inherit it.
@@ -316,7 +317,7 @@ def main() -> None:
 
             remove_empty_folders()
             print(f"shaketwin: {error}", file=sys.stderr)
-            raise SystemExit(2) from None
+            raise SystemExit(EXIT_FAILED) from None
         except OSError as error:
             if isinstance(error, BrokenPipeError):
                 raise
@@ -324,4 +325,4 @@ def main() -> None:
             if sys.argv[1:2] in (["run"], ["campaign"]):  # the others record nothing
                 advice = "; the recording is kept: run `shaketwin report DIR` after correcting this"
             print(f"shaketwin: {error}{advice}", file=sys.stderr)
-            raise SystemExit(2) from None
+            raise SystemExit(EXIT_FAILED) from None

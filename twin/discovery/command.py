@@ -39,9 +39,9 @@ from twin.discovery.words import (
     format_share,
     format_verdict,
 )
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.results.quantities import format_quantity
 from twin.setup.folders import make_output_folder, make_run_folder, remove_empty_folders
+from twin.system.exit_codes import EXIT_INTERRUPTED
 from twin.system.progress import make_task_bar
 from twin.system.terminal import catch_interrupts, console, print_line, print_table
 

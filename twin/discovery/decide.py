@@ -13,9 +13,9 @@ from twin.discovery.result import ChainLink, Verdict
 from twin.discovery.selection import Cancelled
 from twin.discovery.task import DiscoveredModel, PathLike, discover
 from twin.live.run_command import run_test
-from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.results.recordings import open_recording
 from twin.setup.folders import make_output_folder, make_run_folder
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.transport.endpoint import DEFAULT_ENDPOINT
 
 

@@ -18,7 +18,7 @@ from twin.exchange.export import ExportOptions, export_log
 from twin.exchange.import_table import ImportOptions, import_table, propose_import
 from twin.exchange.proposal import MapProposal
 from twin.recording.tabular import parse_step_range
-from twin.report.finalize import EXIT_GAPS
+from twin.system.exit_codes import EXIT_GAPS
 from twin.system.progress import RunProgress
 from twin.system.terminal import console, error_console, print_line, print_table
 from twin.transport.codec import Item

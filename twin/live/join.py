@@ -14,10 +14,10 @@ from twin.live.recorder import FLUSH_INTERVAL_S, SYNC_INTERVAL_S, CompletionTrac
 from twin.recording.mcap_log import LogTimeError, LogWriter
 from twin.recording.merge import LOCK_FILE, merge_run_parts
 from twin.recording.run_paths import PARTS_FOLDER
-from twin.report.finalize import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.security.access_control import user_name
 from twin.security.credentials import Credentials
 from twin.setup.folders import RUNS_FOLDER, make_output_folder
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED
 from twin.system.files import lock_file
 from twin.system.terminal import catch_interrupts, print_line
 from twin.transport.codec import TOPIC_TYPES, WireError, decode_item, encode_item, topic_for

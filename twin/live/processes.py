@@ -41,6 +41,7 @@ from twin.live.process_config import (
 from twin.live.recorder import run_recorder
 from twin.setup.run_config import compile_rig_kernels
 from twin.system.diagnostics import configure_logging
+from twin.system.exit_codes import EXIT_FAILED
 from twin.transport.codec import TOPIC_TYPES, Item, encode_item, topic_for
 from twin.transport.endpoint import LOCAL_SOCKET_PREFIX
 from twin.transport.zenoh_link import RequestQueue, open_hub, open_spoke
@@ -196,7 +197,7 @@ def main() -> None:
         log.info("process %d ends", os.getpid())
     except InputError as error:
         print(error, file=sys.stderr)
-        raise SystemExit(2) from None
+        raise SystemExit(EXIT_FAILED) from None
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@ from pathlib import Path
 from table_io.clock import RealClock
 from twin.log import Log, open_log
 from twin.recording.merge import merge_run_parts
-from twin.report.finalize import EXIT_ABORTED, EXIT_INTERRUPTED, print_outcome, write_results
+from twin.report.finalize import print_outcome, write_results
 from twin.security.credentials import Credentials, credentials_folder
 from twin.setup.disk import require_disk_space
 from twin.setup.folders import RUNS_FOLDER, make_run_folder
@@ -15,6 +15,7 @@ from twin.setup.realtime import check_full_speed, check_realtime
 from twin.setup.run_config import RunConfig, list_test_warnings, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.setup.warm_up import compile_kernels
+from twin.system.exit_codes import EXIT_ABORTED, EXIT_INTERRUPTED
 from twin.system.progress import RunProgress
 from twin.system.terminal import catch_interrupts, console, print_line, show_status
 from twin.transport.endpoint import check_endpoint

@@ -33,19 +33,14 @@ from twin.replay.task import (
     require_drive_channel,
     select_span,
 )
-from twin.report.finalize import (
-    EXIT_GAPS,
-    EXIT_INTERRUPTED,
-    EXIT_NOT_IDENTICAL,
-    print_outcome,
-    show_progress,
-)
+from twin.report.finalize import print_outcome, show_progress
 from twin.results import summary as summaries
 from twin.results.contract import write_json
 from twin.results.contracts import Jump, ReplayResult, Response, RunSummary
 from twin.security.credentials import Credentials
 from twin.setup.folders import make_run_folder
 from twin.setup.unpaced import ItemHandler, ShownRun
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED, EXIT_NOT_IDENTICAL
 from twin.system.terminal import console, print_line, print_table
 from twin.system.versions import format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item

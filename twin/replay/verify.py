@@ -15,10 +15,10 @@ from twin.recording.mcap_log import LogWriter
 from twin.recording.reader import Recording, select_messages
 from twin.recording.recovery import Damage, LogMessage, RecoveredLog, recover_log
 from twin.recording.run_paths import explain_unmerged_parts as scattered
-from twin.report.finalize import EXIT_GAPS
 from twin.results.contract import format_json
 from twin.results.recordings import list_parts, read_recorded_config
 from twin.results.sensor_table import SensorRow, build_sensor_rows
+from twin.system.exit_codes import EXIT_GAPS
 from twin.system.terminal import console, print_line, print_table
 from twin.system.versions import (
     VersionPairs,

@@ -11,10 +11,9 @@ from twin.results.summary import format_summary, summarise
 from twin.results.twin_verdict import format_twin_verdict
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import ShownRun
+from twin.system.exit_codes import EXIT_ABORTED, EXIT_GAPS
 from twin.system.progress import RunProgress
 from twin.system.terminal import VERDICT_COLOURS, console, print_line
-
-EXIT_ABORTED, EXIT_GAPS, EXIT_NOT_IDENTICAL, EXIT_INTERRUPTED = 3, 4, 5, 130
 
 
 def show_progress(run: ShownRun) -> RunProgress:

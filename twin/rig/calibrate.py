@@ -20,8 +20,9 @@ from table_io.config.rig import RigConfig
 from table_io.config.rig_file import calibrations_dir, load_rig
 from table_io.config.sensor import CalibrationRecord, SensorConfig, format_calibration_toml
 from table_io.errors import InputError, suggest
-from twin.rig.check_table import EXIT_FAILED, make_machine
+from twin.rig.check_table import make_machine
 from twin.security.access_control import user_name
+from twin.system.exit_codes import EXIT_FAILED
 from twin.system.terminal import print_line
 
 MEASURING_S, PAUSE_S = 1.0, 5.0

@@ -47,7 +47,6 @@ from table_io.safety.wiring_check import (
 )
 from twin.live.process_config import request_realtime
 
-EXIT_FAILED = 2
 CHECK_PRIORITY = 50  # as for a rig: the machine's watchdog acts on a silent client
 TARE_S, REST_S, BLOCK_S = 1.0, 4.0, 0.02
 # Phases of a stimulus by hand: see `_record_response`.

@@ -10,7 +10,8 @@ from rich.table import Table
 
 from table_io.safety.wiring_check import CheckLine, RestingInputs
 from twin.results.contract import format_json
-from twin.rig.check_table import EXIT_FAILED, WiringCheckResult, check_table
+from twin.rig.check_table import WiringCheckResult, check_table
+from twin.system.exit_codes import EXIT_FAILED
 from twin.system.terminal import console, print_line, print_table
 
 

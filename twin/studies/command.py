@@ -1,12 +1,12 @@
 """`simulate` with several models or gaps, and `map`: call the task, print its result."""
 
 from table_io.errors import InputError
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.studies import DEFINITION_FILE
 from twin.studies.maps.page import write_map_page
 from twin.studies.maps.store import read_definition
 from twin.studies.maps.task import MapOptions, compute_map, require_packages
 from twin.studies.task import SweepOptions, simulate_sweeps
+from twin.system.exit_codes import EXIT_INTERRUPTED
 from twin.system.grid import watch_on_terminal
 from twin.system.terminal import print_line
 

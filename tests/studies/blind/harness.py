@@ -14,8 +14,8 @@ from typing import Any
 from table_io.clock import RealClock
 from table_io.errors import InputError
 from tests.studies.blind.cases import LaboratoryLevel, draw_case, list_case_numbers
-from twin.report.finalize import EXIT_INTERRUPTED
 from twin.setup.folders import claim_folder, find_sharing_problem, make_output_folder
+from twin.system.exit_codes import EXIT_INTERRUPTED
 from twin.system.process_pool import Task, Workers, run_tasks
 from twin.system.progress import make_task_bar
 from twin.system.terminal import catch_interrupts, print_line
