@@ -58,7 +58,10 @@ def test_where_nothing_is_hidden_nothing_is_named() -> None:
     ("truth", "key", "value"),
     [
         (format_truth("bumper_hardening", k2=3e7), EffectKey("bumper_hardening", "k2"), 3e7),
-        (format_truth("coulomb_friction", fc=30.0), EffectKey("coulomb_friction", "fc"), 30.0),
+        pytest.param(
+            format_truth("coulomb_friction", fc=30.0),
+            EffectKey("coulomb_friction", "fc"), 30.0, marks=pytest.mark.slow,
+        ),
         pytest.param(
             format_truth("maxwell_damper", k1=8e3, tau=0.05),
             EffectKey("maxwell_damper", "k1"), 8e3, marks=pytest.mark.slow,
@@ -316,7 +319,7 @@ def test_short_logs_are_enough_together() -> None:
     """None of them has nine cycles or 1,000 samples of its own."""
     whole = log("")
     moving = np.flatnonzero(whole.signals.label != Label.REST)
-    pieces = [shorten(whole, piece) for piece in np.array_split(moving, 24)[4:20:2]]
+    pieces = [shorten(whole, piece) for piece in np.array_split(moving, 24)[4:14:2]]
     with raises_input_error(where=pieces[0].signals.name, allowed="9 cycles"):
         prepare_problem(pieces[:1], SNM)
     with raises_input_error(allowed="in all logs together"):

@@ -28,7 +28,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=[pytest.mark.slow] if case.endswith("free") else [])
+        for case in CASES
+    ],
+)
 def test_the_parameters_are_those_of_the_specimen(case: str, tmp_path: Path) -> None:
     instruments, gap_mm, test = CASES[case]
     specimen = Specimen(gap_mm=gap_mm)
