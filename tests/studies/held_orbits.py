@@ -8,6 +8,7 @@ The command is read where it is written to the rig, so its acceleration is exact
 """
 
 import argparse
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -45,7 +46,7 @@ REST_M = 1e-6
 
 @dataclass(frozen=True)
 class HeldTest:
-    """A played test: its orbits, how it ended, the command in m, and what `check` bounds."""
+    """A played test: its orbits, how it ended, the command in m, and what `check` bounds of it."""
 
     accepted: int
     planned: int
@@ -86,7 +87,7 @@ def play(
 
     backend.queue = record  # type: ignore[method-assign]
     progress = [0]  # samples so far
-    accepted, stop, is_whole = 0, None, True
+    accepted, stop, is_whole, correction = 0, None, True, 1.0
     for item in run_session(
         config.session_setup, backend, clock, config.make_start_factory("held", "table"),
         lambda: operate(progress[0]), take_back=find_take_back(backend, clock),
@@ -96,6 +97,9 @@ def play(
             progress[0] = item.end
         elif isinstance(item, OrbitPoint):
             accepted += item.accepted
+            # A table that follows with a gain below 1 takes a larger command for its level.
+            command_m_s2 = item.command_m * (math.tau * item.frequency_hz) ** 2
+            correction = max(correction, command_m_s2 / item.acceleration_m_s2)
         elif isinstance(item, RunStop):
             stop = item
     assert stop is not None
@@ -106,7 +110,7 @@ def play(
     command_m = written[:end] * rig.output.span_mm * 1e-3 / rig.output.span_v
     return HeldTest(
         accepted, len(continuation.orbit_plan.points), stop.verdict, stop.reason, command_m,
-        config.drive.rate_hz, bound, continuation.acceleration_g * GRAVITY_M_S2,
+        config.drive.rate_hz, bound * correction, continuation.acceleration_g * GRAVITY_M_S2,
         is_whole and stop.index == end,
     )  # fmt: skip
 

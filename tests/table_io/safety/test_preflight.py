@@ -160,29 +160,32 @@ def test_feedback_adds_to_every_demand_of_a_step_and_to_no_loop_check() -> None:
         level, w = LEVEL_M_S2, 2 * math.pi * plain.frequency_hz
         assert d == pytest.approx(motion_of(plain)[0] + 0.4 * level / w**2)
         assert v == pytest.approx(math.sqrt(2.0 * d * a))  # |q'|^2 <= 2 |q| |q''|
-        assert 1.3 * level <= a <= 1.33 * level
+        assert 1.4 * level <= a <= 1.43 * level
         assert row.force_n == pytest.approx(2550.0 * a)
         assert row.amplitude_lsb == plain.amplitude_lsb  # of the smallest, without feedback
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_stop_from_anywhere_with_the_largest_feedback_stays_within_the_demand(seed: int) -> None:
-    """Corrections of any phase that leave the command within its acceleration end in a decay."""
+    """Corrections that raise the command, within its acceleration, end in a decay."""
     rng, rate_hz, f, share = np.random.default_rng(seed), 1000.0, 2.0, 0.4
     level, w = LEVEL_M_S2, 2 * math.pi * f
     hold = Segment(0, 8000, Label.SETTLE, 0, f, f, level, level, 0.0, 16)
     t = np.arange(6000) / rate_hz
-    wave = np.sin(w * t + rng.uniform(0.0, math.tau)) * np.sin(np.pi * np.arange(6000) / 6000) ** 3
+    wave = (
+        np.sin(w * t + math.pi + rng.uniform(-1.0, 1.0))
+        * np.sin(np.pi * np.arange(6000) / 6000) ** 3
+    )
     wave *= share * level / w**2
     held = Drive(rate_hz, (hold,), ()).command(1000, 6000)
-    while np.abs(np.diff(held + wave, 2)).max() * rate_hz**2 > 1.3 * level:
+    while np.abs(np.diff(held + wave, 2)).max() * rate_hz**2 > 1.4 * level:
         wave *= 0.99
     correction = Correction(1000, wave)
     drive = Drive(rate_hz, (hold,), (Step(0, "forward", f, level),), correction=correction)
     (row,) = compute_demands(drive, make_controlled(share), RIG)
     peaks = [np.abs(differentiate(drive.decay_from(at).command(at - 500, 2000), rate_hz)[2]).max()
              for at in range(3000, 5000, 37)]  # fmt: skip
-    assert 0.6 * row.acceleration_m_s2 < max(peaks) <= row.acceleration_m_s2 * (1 + 1e-6)
+    assert 0.8 * row.acceleration_m_s2 < max(peaks) <= row.acceleration_m_s2 * (1 + 1e-6)
 
 
 def test_loop_check_has_its_rows_before_the_steps() -> None:
