@@ -21,13 +21,14 @@ CONVERTED_MARK = "# variable "  # begins the remark above the columns of a conve
 MIN_ALIKE_SHARE = 0.9  # of the rows below the first one of samples, by which cells are text
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 FORTRAN = re.compile(r"\s*[-+]?\d*\.?\d*[dD][-+]?\d+\s*")
-# With marks of thousands that cannot be decimal commas: 1,234.5 and 1'234.
+# Words that loggers and spreadsheets write for a lost sample, in lower case.
 LOST_MARKS = {
     "na", "n/a", "#n/a", "null", "-", "--", "---", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan",
     "1.#ind", "-1.#ind",
 }  # fmt: skip
 # A minus sign, an apostrophe, and blanks that do not break, between thousands.
 PLAIN_MARKS = str.maketrans({"−": "-", "’": "'", "\u00a0": "'", "\u202f": "'", "\u2009": "'"})
+# With marks of thousands that cannot be decimal commas: 1,234.5 and 1'234.
 THOUSANDS = re.compile(r"\s*[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:'\d{3})+(?:\.\d*)?)\s*")
 ROW_WORDS = ("TS", "RN")  # units of a time stamp and of a row number, in loggers of Campbell
 # Line below the units of those loggers: how the samples of a column were reduced.

@@ -740,8 +740,8 @@ class LogResiduals:
     def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
         """Return the residuals with what a fitted model leaves counted as noise of single steps.
 
-        What may remain where the residual is said to be noise is none.
-        So the priors of the nuisances are not outvoted by a misfit that is no error of theirs.
+        So the priors of the nuisances are not outvoted by a misfit that is no error of theirs. What
+        may remain where a residual is said to be noise, up to MAX_LEVEL, is no misfit.
         """
         squares, factors = self.evaluate(parameters) ** 2, {}
         for row, name in enumerate(self.rows):
