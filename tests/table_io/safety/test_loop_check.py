@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any
@@ -86,7 +86,7 @@ def record_loop_check(name: str, rate_hz: float = 2000.0) -> CheckRun:
 
 
 def evaluate_checks(
-    check_run: CheckRun | str, changes: dict[str, Change] | None = None
+    check_run: CheckRun | str, changes: Mapping[str, Change] | None = None
 ) -> tuple[Check, ...]:
     """Return the lines of a recorded check (by the name of its test), with changed channels."""
     recorded = record_loop_check(check_run) if isinstance(check_run, str) else check_run
@@ -97,7 +97,9 @@ def evaluate_checks(
     return evaluate(replace(block, values=values), drive, profile, RIG, noise)[0]
 
 
-def list_failures(check_run: CheckRun | str, changes: dict[str, Change] | None = None) -> set[Line]:
+def list_failures(
+    check_run: CheckRun | str, changes: Mapping[str, Change] | None = None
+) -> set[Line]:
     """Return the lines that fail."""
     checks = evaluate_checks(check_run, changes)
     return {(check.name, check.channel) for check in checks if not check.passed}
@@ -486,7 +488,7 @@ def test_table_that_lags_more_than_its_drive_relies_on_fails() -> None:
 
 
 def test_drive_of_another_loop_check_leaves_the_smooth_curve() -> None:
-    profile, *others = rely_on_measured_response("gm10", gain_ratio=2.0)
+    profile, block, drive, noise = rely_on_measured_response("gm10", gain_ratio=2.0)
     response = profile.plan.response
     assert response is not None
     levels = tuple(2.0 * level for level in response.levels_m_s2)
@@ -494,7 +496,7 @@ def test_drive_of_another_loop_check_leaves_the_smooth_curve() -> None:
     other.__dict__["plan"] = replace(
         profile.plan, response=response.model_copy(update={"levels_m_s2": levels})
     )
-    assert list_failures((other, *others)) == set()
+    assert list_failures((other, block, drive, noise)) == set()
 
 
 def test_noise_at_the_tare_counts_too() -> None:
