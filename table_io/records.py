@@ -80,12 +80,27 @@ class Comparison:
 class PredictionHash:
     """Hash of the twin's output over samples index .. index + count - 1.
 
-    So a replay proves that it predicts the same also where no predictions were recorded.
+    So a replay proves that it predicts the same also where no predictions were recorded. `free` and
+    `window` are the states of the two solvers after these samples, from which what follows is
+    computed without what came before; empty of most hashes, and where they are not enough.
     """
 
     index: int
     count: int
     digest: bytes  # BLAKE2b, 16 bytes
+    free: tuple[float, ...] = ()
+    window: tuple[float, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """Index of the first sample after those of the hash."""
+        return self.index + self.count
+
+    def is_same_output(self, other: "PredictionHash | None") -> bool:
+        """Return whether another hash is of the same samples and the same output."""
+        return other is not None and (self.index, self.count, self.digest) == (
+            other.index, other.count, other.digest,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

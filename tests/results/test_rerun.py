@@ -9,15 +9,19 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import PredictionHash
+from twin.compare import pipeline
+from twin.compare.monitoring.low_cut import LowCutFilter, LowCutRemoval
 from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
+from twin.recording.columns import StoredItems
 from twin.recording.log_metadata import select_recorded
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
 from twin.replay.verify import examine_logs
+from twin.results import rerun
 from twin.results.recordings import read_recorded_config
-from twin.results.rerun import restore_predictions
+from twin.results.rerun import Predictions, restore_predictions
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import play_unpaced
 
@@ -159,3 +163,47 @@ def test_the_selection_does_not_depend_on_block_boundaries(sparse: Recording, si
         parts += select_recorded(some.cut(first, min(first + size, len(some))), sparse.start)
     samples = [sample for part in parts for sample in range(part.index, part.end)]
     assert samples == [sample for sample in range(1998) if sample // 20 % 10 == 0]
+
+
+def test_a_part_is_computed_from_the_saved_states_before_it(
+    sparse: Recording, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (whole,) = recording.contiguous_blocks("pred")
+    monkeypatch.setattr(
+        rerun, "restore_predictions", lambda *_: pytest.fail("rerun from the start")
+    )
+    saved = [entry.end for entry in sparse.records(PredictionHash) if entry.free]
+    assert saved == [*range(4000, whole.end + 1, 4000)]
+    predictions = Predictions(sparse)
+    last_hash = sparse.records(PredictionHash)[-1].end
+    for first, end in ((4200, 4201), (4999, 9000), (8000, 12345), (saved[-1], last_hash)):
+        (block,) = predictions.read(first, end)
+        assert block.is_identical(whole.cut(first, end)), (first, end)
+
+
+def test_a_saved_state_that_does_not_lead_to_the_hashes_is_not_used(
+    sparse: Recording, recording: Recording
+) -> None:
+    (whole,) = recording.contiguous_blocks("pred")
+    entries = [
+        replace(item, free=(item.free[0] + 1e-3, *item.free[1:]))
+        if isinstance(item, PredictionHash) and item.free
+        else item
+        for item in sparse.items.entries
+    ]
+    changed = Predictions(replace(sparse, items=StoredItems(entries)))
+    (block,) = changed.read(5000, 9000)
+    assert block.is_identical(whole)
+
+
+def test_no_state_is_saved_while_a_low_cut_is_removed(
+    bundle: RunConfig, recording: Recording
+) -> None:
+    """Then the twin's input depends on filters, whose states are not in the record."""
+    setup, (measured,) = bundle.prepare_twin(), recording.contiguous_blocks("meas")
+    plain, _ = pipeline.start_pipeline(setup, 3390)
+    removal = LowCutRemoval({"mass_acc_m_s2": LowCutFilter(low_cut=1.0)})
+    for state, is_saved in ((plain, True), (replace(plain, low_cuts=removal), False)):
+        items = pipeline.step(setup, state, measured.cut(3390, 4010))[1]
+        hashes = [item for item in items if isinstance(item, PredictionHash)]
+        assert any(entry.free for entry in hashes) == is_saved

@@ -30,7 +30,7 @@ from twin.compare.monitoring import MonitoringState
 from twin.compare.monitoring.cycle import CycleData, MonitoringSetup
 from twin.compare.monitoring.jumps import ExpectedJump, predict_jumps
 from twin.compare.monitoring.low_cut import LowCutRemoval
-from twin.compare.prediction_hash import HASHED_BLOCKS, hash_cells
+from twin.compare.prediction_hash import hash_cells
 from twin.compare.sensors import remove_sensor_errors
 from twin.compare.twins import TwinSetup, TwinStates, advance_twins, start_twins
 from twin.model import valid_range
@@ -97,6 +97,22 @@ class PipelineState:
     unhashed: Float2D = field(default_factory=lambda: np.empty((len(TWIN_CHANNELS), 0)))
 
 
+def prepare_twins(
+    profile: Profile, model: Model, from_rest: bool = False, extra_channels: Iterable[Channel] = ()
+) -> TwinSetup:
+    """Prepare the setup of the twins; of the extra channels the predicted ones are compared."""
+    rate_hz = profile.acquisition.rate_hz
+    return TwinSetup(
+        model,
+        rate_hz,
+        round(profile.comparison.window_s * rate_hz),
+        profile.acquisition.block_samples,
+        profile.comparison.contact_n,
+        from_rest,
+        select_predicted(extra_channels),
+    )
+
+
 def prepare_pipeline(
     profile: Profile,
     model: Model,
@@ -104,25 +120,17 @@ def prepare_pipeline(
     from_rest: bool = False,
     extra_channels: Iterable[Channel] = (),
 ) -> PipelineSetup:
-    """Prepare the setup of a run; of the extra channels those that the model predicts are compared.
+    """Prepare the setup of a run, of its twins as `prepare_twins` does.
 
     u* and a* are the free-flight maxima, continuous in frequency, of the model's linear part: one
     scale, independent of its effects.
     """
-    rate_hz = profile.acquisition.rate_hz
     level = max((step.acceleration_m_s2 for step in steps), default=profile.plan.level_m_s2)
     u_star, a_star, _ = free_flight_resonance(model.parameters, level)
-    contact_n = profile.comparison.contact_n
-    twin = TwinSetup(
-        model,
-        rate_hz,
-        round(profile.comparison.window_s * rate_hz),
-        profile.acquisition.block_samples,
-        contact_n,
-        from_rest,
-        select_predicted(extra_channels),
+    twin = prepare_twins(profile, model, from_rest, extra_channels)
+    scale = PrcScale(
+        model.parameters, twin.rate_hz, twin.contact_n, u_star, a_star, profile.specimen.gaps_m
     )
-    scale = PrcScale(model.parameters, rate_hz, contact_n, u_star, a_star, profile.specimen.gaps_m)
     if not steps or profile.continuation is not None:  # no numbered cycles, no curves
         return PipelineSetup(twin, scale, steps, measured_cycles=0)
     expected_jumps = predict_jumps(profile, model, steps)
@@ -192,9 +200,10 @@ def step(
     predicted = join_blocks(pieces)
     state, events = _watch_ranges(setup, state, block, predicted)
     events += _list_failures(setup, state, known_failures)
-    cell_samples = HASHED_BLOCKS * setup.twin.grid_samples
-    unhashed, hashes = hash_cells(state.unhashed, block.end, predicted.values, cell_samples)
-    state = replace(state, unhashed=unhashed)
+    unhashed, hashes = hash_cells(
+        state.unhashed, block.end, predicted.values, setup.twin.hash_samples, state.twins.saved
+    )
+    state = replace(state, unhashed=unhashed, twins=replace(state.twins, saved={}))
     return state, [predicted, *compared, *hashes, *records, *events]
 
 
@@ -246,6 +255,8 @@ def _advance_piece(
     """Advance the twins over samples of one cycle: return (state, predicted, Comparisons)."""
     low_cuts, corrected = state.low_cuts.apply(piece)
     twins, predicted, comparisons = advance_twins(setup.twin, state.twins, corrected)
+    if state.low_cuts.is_active:  # then the solvers' states are not all that is needed
+        twins = replace(twins, saved=state.twins.saved)
     blocks = (piece, predicted, corrected)
     available = [blocks] if state.recent is None else [state.recent, blocks]
     start, end, lead = piece.index, piece.end, setup.scale.lead_samples

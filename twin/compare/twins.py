@@ -25,6 +25,8 @@ from twin.model.solver import OUTPUT_COUNT, Solver, StateEstimate
 HISTORY_S = 0.1  # of measured motion, from which a restart estimates u and u'
 PREDICTED_ROWS = 5  # of a solver's: u, v, a, F_R, F_L
 MEMORY_RELAXATION_TIMES = 8.0  # after which a bumper has forgotten a contact
+HASHED_CELLS = 10  # of the comparison, in one hash of the predictions
+SAVED_HASHES = 20  # between those that state the solvers' states: 2 s in blocks of 10 ms
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,11 @@ class TwinSetup:
     def solver(self) -> Solver:
         return prepare_solver(self.model, self.rate_hz)
 
+    @property
+    def hash_samples(self) -> int:
+        """Number of samples in one hash of the predictions."""
+        return HASHED_CELLS * self.grid_samples
+
     @cached_property
     def delay_samples(self) -> int:
         """Number of past samples that the sensors' lags need."""
@@ -71,12 +78,16 @@ class TwinSetup:
         return round(min(max(HISTORY_S, MEMORY_RELAXATION_TIMES * slowest), 2.0) * self.rate_hz)
 
 
+SavedStates = tuple[tuple[float, ...], tuple[float, ...]]  # free and window; () while unknown
+
+
 @dataclass(frozen=True, slots=True)
 class TwinStates:
     """State of both twins before sample `index`; `past` holds u, a - A, A, F_R, F_L (5, n).
 
     `lag_history` holds the last samples of the prediction without sensor effects, as many as a lag
     needs. `failures`: the first sample, by twin, at which it was not finite on finite input.
+    `saved`: the solvers' states (free, window) by the number of samples after which they were so.
     """
 
     index: int
@@ -86,6 +97,7 @@ class TwinStates:
     squares: Float2D  # (3, channel, sample) of the unfinished grid cell
     lag_history: Float2D
     failures: Mapping[str, int] = field(default_factory=dict)
+    saved: Mapping[int, SavedStates] = field(default_factory=dict)
 
 
 def start_twins(setup: TwinSetup, index: int) -> TwinStates:
@@ -95,6 +107,26 @@ def start_twins(setup: TwinSetup, index: int) -> TwinStates:
     return TwinStates(
         index, free, None, np.empty((5, 0)), no_squares, np.empty((len(TWIN_CHANNELS), 0))
     )
+
+
+def resume_twins(setup: TwinSetup, saved: SavedStates, before: Block) -> TwinStates:
+    """Return twins in saved states of their solvers at the end of block `before`.
+
+    They go on as if they had computed what came before, but for a sensor's lag, which is unknown at
+    first, if the block has `TwinSetup.history_samples`, or begins where the twins did.
+    """
+    free, window = (np.array(state) if state else None for state in saved)
+    past = _measure_motion(setup, before)[:, -setup.history_samples :]
+    return replace(start_twins(setup, before.end), free=free, window=window, past=past)
+
+
+def _measure_motion(setup: TwinSetup, block: Block) -> Float2D:
+    """Return u, a - A, A, F_R, F_L of a measured block, (5, sample), as `TwinStates.past`."""
+    corrected = remove_sensor_errors(setup.model.sensors, block)
+    base_acc = block.channel("table_acc_m_s2")
+    relative_acc = _channel_or_nan(corrected, "mass_acc_m_s2") - base_acc
+    u, forces = relative_displacement(corrected), contact_forces(corrected)
+    return np.array([u, relative_acc, base_acc, *forces])
 
 
 def estimate_motion(u: Float1D, relative_acc: Float1D, rate_hz: float) -> tuple[float, float]:
@@ -228,23 +260,19 @@ def advance_twins(
         twins = start_twins(setup, block.index)
     base_acc = np.ascontiguousarray(block.channel("table_acc_m_s2"))
     table_disp = _channel_or_nan(block, "table_disp_m")
-    corrected = remove_sensor_errors(setup.model.sensors, block)
-    u = relative_displacement(corrected)
-    force_r, force_l = contact_forces(corrected)
-    relative_acc = _channel_or_nan(corrected, "mass_acc_m_s2") - base_acc
-    past = np.concatenate([twins.past, [u, relative_acc, base_acc, force_r, force_l]], axis=1)
+    past = np.concatenate([twins.past, _measure_motion(setup, block)], axis=1)
     past_samples = twins.past.shape[1]
 
     free = None if twins.free is None else twins.free.copy()
     window = None if twins.window is None else twins.window.copy()
     outputs: dict[str, list[Float2D]] = {name: [] for name in TWIN_NAMES}
-    failures = dict(twins.failures)
+    failures, saved = dict(twins.failures), dict(twins.saved)
+    saved_samples = SAVED_HASHES * setup.hash_samples
     first_restart = -block.index % setup.window_samples
-    ends = [*range(first_restart + 1, n + 1, setup.window_samples), n]
+    restarts = range(first_restart + 1, n + 1, setup.window_samples)
+    saves = range(-block.index % saved_samples or saved_samples, n + 1, saved_samples)
     start = 0
-    for end in ends:
-        if start == end:
-            continue
+    for end in sorted({*restarts, *saves, n}):
         drive = base_acc[start:end], table_disp[start:end]
         for name, state in zip(TWIN_NAMES, (free, window), strict=True):
             out, failed = _advance_twin(state, setup, *drive)
@@ -261,6 +289,8 @@ def advance_twins(
             window = None if restarted is None else restarted.copy()
             if _is_lost(free):
                 free = restarted
+        if end in saves:
+            saved[block.index + end] = _save_state(free), _save_state(window)
         start = end
     twin_rows = (np.concatenate(rows, axis=1) for rows in outputs.values())
     true_values = np.array([row for out in twin_rows for row in _twin_channels(out, table_disp)])
@@ -286,8 +316,13 @@ def advance_twins(
         squares=squares,
         lag_history=keep_last(true_values, twins.lag_history, setup.delay_samples),
         failures=failures,
+        saved=saved,
     )
     return after, predicted, comparisons
+
+
+def _save_state(state: Float1D | None) -> tuple[float, ...]:
+    return () if state is None else tuple(state.tolist())
 
 
 def _channel_or_nan(block: Block, name: str) -> Float1D:

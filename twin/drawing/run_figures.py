@@ -40,7 +40,7 @@ from twin.results.report_data import (
     select_frequencies,
 )
 from twin.results.summary import parse_toml_tables
-from twin.results.windows import cut_blocks, extract_free_twin, join_channel
+from twin.results.windows import extract_free_twin, join_channel
 
 HISTORY_CYCLES = 3
 CONTACT_ALPHAS = 0.22, 0.10  # right, left
@@ -248,8 +248,8 @@ def draw_window_histories(run: ReportData) -> CaptionedFigures:
         return
     rate_hz = run.recording.start.rate_hz
     first, end = round(windows[0].from_s * rate_hz), round(windows[-1].to_s * rate_hz)
-    measured = cut_blocks(run.streams["meas"], first, end)
-    twin = [extract_free_twin(block) for block in cut_blocks(run.streams["pred"], first, end)]
+    measured = run.read_stream("meas", first, end)
+    twin = [extract_free_twin(block) for block in run.read_stream("pred", first, end)]
     rows = 4 if run.has_bumpers else 3
     strips = RESIDUALS if run.source == "measured" and twin else ()
     heights = [2.0] * rows + [1.0] * len(strips)

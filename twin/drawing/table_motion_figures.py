@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from table_io.block import Block, Float1D
+from table_io.block import Float1D
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.units import GRAVITY_M_S2
@@ -30,7 +30,7 @@ from twin.results.spectra import (
 )
 from twin.results.table_motion import TableMotion, find_table_motion
 from twin.results.tracking import MAX_BAND_RATIO, SA_TOLERANCE, delay_record, keep_band
-from twin.results.windows import cut_blocks, extract_free_twin, join_channel
+from twin.results.windows import extract_free_twin, join_channel
 
 DETAIL_PERIODS = 6.0  # of the middle of the band, that the detail shows around the peak
 BAND_MARGIN = 2.0  # factor beyond the band that is drawn of a spectrum
@@ -299,7 +299,7 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
 def _extract_mass_records(run: ReportData, motion: TableMotion) -> Iterator[tuple[str, Float1D]]:
     """Yield (source, acceleration of the mass in m/s2, (sample,)) of those without a gap."""
     for source, stream in (("measured", "meas"), ("twin", "pred")):
-        blocks: list[Block] = cut_blocks(run.streams[stream], motion.start, motion.end)
+        blocks = run.read_stream(stream, motion.start, motion.end)
         if source == "twin":
             blocks = [extract_free_twin(block) for block in blocks]
         record = join_channel(blocks, "mass_acc_m_s2")

@@ -333,7 +333,7 @@ def _compare_items(
     for new, payload in zip(items, payloads, strict=True):
         if isinstance(new, PredictionHash) and new.index in recorded.hashes:
             result.hashes_compared += 1
-            if new != recorded.hashes[new.index]:
+            if not new.is_same_output(recorded.hashes[new.index]):
                 result.hashes_differing += 1
                 result.note_difference(new.index)
         elif isinstance(new, Block) and new.stream == "pred" and recorded.predictions:

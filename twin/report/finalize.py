@@ -25,7 +25,9 @@ def write_results(
     folder: Path, run_config: RunConfig, view: bool = False, replay: ReplayResult | None = None
 ) -> RunSummary:
     """Write summary, report and optional view of the run in a folder; return the summary."""
-    recording = restore_predictions(read_recording(folder / "run.mcap"), run_config)
+    recording = read_recording(folder / "run.mcap")
+    if view or not run_config.steps:  # the viewer and a history show every sample
+        recording = restore_predictions(recording, run_config)
     summary = summarise(recording, run_config.parameters)
     if replay is not None:
         summary.replay = replay

@@ -54,7 +54,7 @@ class MeasuredCampaign:
 def _upcrossing_s(run: ReportData, step: int, frequency_hz: float, cycles: int) -> float:
     """Return the time in s from the start of the last `cycles` to the first upcrossing of A."""
     chunks = []
-    for block in run.streams["meas"]:
+    for block in run.measured_blocks:
         in_step = (block.step == step) & (block.label == Label.MEASURE)
         chunks.append(block.channel("table_acc_m_s2")[in_step])
     table_acc, rate = np.concatenate(chunks), run.recording.start.rate_hz

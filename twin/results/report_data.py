@@ -6,6 +6,7 @@ Also selects the steps that are shown in detail.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 from pydantic import ValidationError
@@ -20,8 +21,9 @@ from twin.model.model import Model
 from twin.recording.reader import Recording
 from twin.results.contracts import OrbitResult, RunSummary, StepEntry, WindowResult
 from twin.results.players import SystemMotion
-from twin.results.rerun import restore_predictions
+from twin.results.rerun import Predictions
 from twin.results.summary import parse_toml_tables
+from twin.results.windows import cut_blocks
 
 Curve = tuple[Float1D, Float1D]  # frequency in Hz, ascending, and quantity
 CurvePoint = PrcPoint | StepEntry  # as recorded or simulated, or of a summary
@@ -39,13 +41,27 @@ MAX_INTERVALS, SLOPE_WINDOW_S, MAX_ENVELOPE_BINS = 2, 0.020, 1600
 
 @dataclass(frozen=True)
 class ReportData:
-    """Recording and summary of a run, with the blocks and the specimen that every figure needs."""
+    """Recording and summary of a run, with the specimen that every figure needs."""
 
     recording: Recording
     summary: RunSummary
-    streams: dict[str, tuple[Block, ...]]
     specimen: Specimen | None
     contact_n: float
+
+    @property
+    def measured_blocks(self) -> tuple[Block, ...]:
+        """Measured stream, joined between gaps; of a simulation the motion of the table."""
+        return self.recording.contiguous_blocks("meas")
+
+    def read_stream(self, stream: str, first: int, end: int) -> list[Block]:
+        """Return samples first .. end - 1 of "meas" or "pred"; unrecorded ones are recomputed."""
+        if stream == "meas":
+            return cut_blocks(self.measured_blocks, first, end)
+        return cut_blocks(self._predictions.read(first, end), first, end)
+
+    @cached_property
+    def _predictions(self) -> Predictions:
+        return Predictions(self.recording)
 
     @property
     def steps(self) -> Sequence[StepEntry]:
@@ -101,9 +117,7 @@ def build_report_data(recording: Recording, summary: RunSummary) -> ReportData:
     except ValidationError:
         specimen = None
     contact_n = ComparisonConfig.model_validate(profile.get("comparison") or {}).contact_n
-    recording = restore_predictions(recording)
-    streams = {name: recording.contiguous_blocks(name) for name in ("meas", "pred")}
-    return ReportData(recording, summary, streams, specimen, contact_n)
+    return ReportData(recording, summary, specimen, contact_n)
 
 
 def step_quantity(step: CurvePoint, source: str, name: str) -> float:
@@ -203,13 +217,13 @@ def select_frequencies(run: ReportData) -> dict[float, str]:
 
 def extract_step_motion(run: ReportData, stream: str, step: int) -> StepMotion | None:
     """Return the measured cycles of a step from "meas", or the free-running twin from "pred"."""
-    blocks = []
-    for block in run.streams[stream]:
+    blocks: list[Block] = []
+    for block in run.measured_blocks:
         indices = (
             np.flatnonzero((block.step == step) & (block.label == Label.MEASURE)) + block.index
         )
         if indices.size:
-            blocks.append(block.cut(int(indices[0]), int(indices[-1]) + 1))
+            blocks += run.read_stream(stream, int(indices[0]), int(indices[-1]) + 1)
     if not blocks:
         return None
     first, size = blocks[0].index, blocks[-1].end - blocks[0].index
@@ -269,7 +283,7 @@ def pair_motions(
 def compute_envelopes(run: ReportData) -> tuple[tuple[Block, ...], dict[str, list[Envelope]]]:
     """Return (blocks of the run, envelopes by row of the overview), without rows of no data."""
     name, prefix = ("meas", "") if run.source == "measured" else ("pred", "free/")
-    blocks = run.streams[name] or run.streams["meas"]
+    blocks = run.recording.contiguous_blocks(name) or run.measured_blocks
 
     def get_channel(block: Block, channel: str) -> Float1D:
         missing = np.full(len(block), np.nan)
@@ -312,8 +326,8 @@ def compute_step_errors(run: ReportData) -> dict[str, dict[int, tuple[float, flo
     they are noise.
     """
     records = run.recording.records(Comparison)
-    sample_steps = np.full(max((block.end for block in run.streams["meas"]), default=0), -1)
-    for block in run.streams["meas"]:
+    sample_steps = np.full(max((block.end for block in run.measured_blocks), default=0), -1)
+    for block in run.measured_blocks:
         sample_steps[block.index : block.end] = np.where(
             block.label == Label.MEASURE, block.step, -1
         )

@@ -3,6 +3,7 @@
 import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from table_io.records import (
 )
 from twin.compare import pipeline
 from twin.compare.pipeline import EVENT_KINDS
+from twin.compare.prediction_hash import hash_cells
+from twin.compare.twins import advance_twins, resume_twins
 from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
@@ -51,7 +54,7 @@ def rerun_twin(
     block_samples = block_samples or round(BLOCK_DURATION_S * recording.start.rate_hz)
     setup = config.prepare_twin(from_rest=recording.start.source == "model")
     setup = pipeline.add_steps(setup, *recording.records(StepAdded))
-    faults = [fault for fault in recording.records(Fault) if fault.component == "twin"]
+    faults = _list_twin_faults(recording)
     changes = _parameter_changes(recording, config)
     cuts = {*edges, *(change.index for change in changes)}
     cuts |= {edge for fault in faults for edge in (fault.from_index, fault.to_index)}
@@ -70,6 +73,10 @@ def rerun_twin(
                 yield from start_records
             state, new_records = pipeline.step(setup, state, item)
             yield from new_records
+
+
+def _list_twin_faults(recording: Recording) -> list[Fault]:
+    return [fault for fault in recording.records(Fault) if fault.component == "twin"]
 
 
 def _parameter_changes(recording: Recording, config: RunConfig) -> list[Params]:
@@ -93,6 +100,68 @@ def _iter_source(recording: Recording, block_samples: int, edges: list[int]) -> 
 
     records: Iterable[Item] = [item for item in recording.items if is_rig_item(item)]
     yield from heapq.merge(iter_blocks(), records, key=lambda item: item.index)
+
+
+class Predictions:
+    """Predictions of a recording, of which those that were not recorded are computed when asked."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @cached_property
+    def _config(self) -> RunConfig | None:
+        start = self._recording.start
+        if start.has_all_predictions or DRIVE_CHANNEL not in start.channels:
+            return None
+        try:
+            return read_recorded_config(self._recording)
+        except InputError:
+            return None
+
+    @cached_property
+    def _whole(self) -> tuple[Block, ...]:
+        return restore_predictions(self._recording, self._config).contiguous_blocks("pred")
+
+    def read(self, first: int, end: int) -> tuple[Block, ...]:
+        """Return blocks of predictions with all known ones of samples first .. end - 1."""
+        if self._config is not None and "_whole" not in vars(self):
+            block = _resume_predictions(self._recording, self._config, first, end)
+            if block is not None:
+                return (block,)
+        return self._whole
+
+
+def _resume_predictions(
+    recording: Recording, config: RunConfig, first: int, end: int
+) -> Block | None:
+    """Return the predictions of samples first .. end - 1, computed from the last saved states.
+
+    None where these, the samples or the hashes do not suffice: then the twin must be rerun.
+    """
+    setup = pipeline.prepare_twins(config.profile, config.model)
+    hashes = recording.records(PredictionHash)
+    covering = [entry for entry in hashes if entry.index < end and first < entry.end]
+    changes = [*_list_twin_faults(recording), *_parameter_changes(recording, config)]
+    if not covering or covering[-1].end < end or changes:
+        return None
+    needed = covering[0].index - setup.delay_samples
+    saved = [entry for entry in hashes if entry.free and entry.window and entry.end <= needed]
+    if not saved:
+        return None
+    start, states = saved[-1].end, (saved[-1].free, saved[-1].window)
+    for block in recording.contiguous_blocks("meas"):
+        before = max(start - setup.history_samples, block.index)
+        if not (block.index <= before < start and covering[-1].end <= block.end):
+            continue
+        twins = resume_twins(setup, states, block.cut(before, start))
+        predicted = advance_twins(setup, twins, block.cut(start, covering[-1].end))[1]
+        values = predicted.values[:, covering[0].index - start :]
+        whole = values[:, :0]
+        again = hash_cells(whole, predicted.end, values, setup.hash_samples, {})[1]
+        if len(again) == len(covering) and all(map(PredictionHash.is_same_output, again, covering)):
+            return predicted.cut(first, end)
+        return None
+    return None
 
 
 def is_rig_item(item: Item) -> bool:
@@ -128,7 +197,7 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
         elif isinstance(item, PredictionHash):
             hashes[item.index] = item
     recorded = recording.records(PredictionHash)
-    differing = sum(hashes.get(entry.index) != entry for entry in recorded)
+    differing = sum(not entry.is_same_output(hashes.get(entry.index)) for entry in recorded)
     if differing:
         _warn(recording, f"{differing} of {len(recorded)} hashes differ from those of the run")
     start = replace(recording.start, predictions_every=0)

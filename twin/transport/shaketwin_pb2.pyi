@@ -542,13 +542,17 @@ class Ahead(_message.Message):
     def __init__(self, index: _Optional[int] = ..., step: _Optional[int] = ..., direction: _Optional[str] = ..., frequency_hz: _Optional[float] = ..., kind: _Optional[str] = ..., jump_hz: _Optional[float] = ..., low_hz: _Optional[float] = ..., high_hz: _Optional[float] = ..., run: _Optional[str] = ...) -> None: ...
 
 class PredictionHash(_message.Message):
-    __slots__ = ("index", "count", "digest", "run")
+    __slots__ = ("index", "count", "digest", "run", "free", "window")
     INDEX_FIELD_NUMBER: _ClassVar[int]
     COUNT_FIELD_NUMBER: _ClassVar[int]
     DIGEST_FIELD_NUMBER: _ClassVar[int]
     RUN_FIELD_NUMBER: _ClassVar[int]
+    FREE_FIELD_NUMBER: _ClassVar[int]
+    WINDOW_FIELD_NUMBER: _ClassVar[int]
     index: int
     count: int
     digest: bytes
     run: str
-    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., digest: _Optional[bytes] = ..., run: _Optional[str] = ...) -> None: ...
+    free: _containers.RepeatedScalarFieldContainer[float]
+    window: _containers.RepeatedScalarFieldContainer[float]
+    def __init__(self, index: _Optional[int] = ..., count: _Optional[int] = ..., digest: _Optional[bytes] = ..., run: _Optional[str] = ..., free: _Optional[_Iterable[float]] = ..., window: _Optional[_Iterable[float]] = ...) -> None: ...

@@ -69,9 +69,14 @@ class LowCutRemoval:
 
     filters: dict[str, LowCutFilter] = field(default_factory=dict)
 
+    @property
+    def is_active(self) -> bool:
+        """Whether a low cut is removed."""
+        return any(each.low_cut for each in self.filters.values())
+
     def apply(self, block: Block) -> tuple["LowCutRemoval", Block]:
         """Return (removal after the block, block without low cuts)."""
-        if not any(each.low_cut for each in self.filters.values()):
+        if not self.is_active:
             return self, block
         values, filters = block.values.copy(), dict(self.filters)
         for name, each in self.filters.items():
