@@ -31,6 +31,7 @@ from twin.transport import shaketwin_pb2 as pb
 from twin.transport.codec import (
     Item,
     WireError,
+    decode_comparisons,
     decode_item,
     encode_comparisons,
     encode_item,
@@ -337,6 +338,40 @@ def test_comparisons_at_once_have_the_bytes_of_each(run: str) -> None:
     series.append(Comparison(5, 1, ("u", "a"), ODD[:2], ODD[2:4], ODD[4:]))
     assert encode_comparisons(series, run) == [encode_item(each, run) for each in series]
     assert encode_comparisons([], run) == []
+
+
+def decode_alone(payload: bytes) -> tuple[str, Item] | None:
+    try:
+        return decode_item(endpoint.CMP_TOPIC, payload)
+    except WireError:
+        return None
+
+
+@pytest.mark.parametrize("run", ["", "a", "r" * 200])
+def test_comparisons_decoded_at_once_are_those_decoded_one_by_one(run: str) -> None:
+    """Also of damaged ones, whose damage may lie in any byte: the others are not decoded."""
+    rng = np.random.default_rng(2)
+    series = [
+        Comparison(index, 20, names, *(tuple(row) for row in rng.random((3, len(names))).tolist()))
+        for names in (("u", "a"), (), ("u", "b"))
+        for index in (0, 3, 127, 128, 300, 301, 2**40, 2**40 + 1)
+    ]
+    whole = encode_comparisons(series, run)
+    for first in range(0, len(series), 8):  # of one channel set each, as in a recording
+        expected = [(run, each) for each in series[first : first + 8]]
+        assert decode_comparisons(whole[first : first + 8]) == expected
+    assert decode_comparisons([]) == []
+    damaged = []
+    for payload in whole * 40:
+        values = bytearray(payload)
+        values[int(rng.integers(len(values)))] ^= 1 << int(rng.integers(8))
+        damaged.append(bytes(values))
+    mixed = [payload for pair in zip(whole * 40, damaged, strict=True) for payload in pair]
+    decoded = decode_comparisons(mixed)
+    assert sum(each is not None for each in decoded) > len(mixed) / 4
+    for payload, each in zip(mixed, decoded, strict=True):
+        if each is not None:
+            assert repr(each) == repr(decode_alone(payload))
 
 
 def test_a_flat_schema_has_its_columns_in_order() -> None:

@@ -34,10 +34,11 @@ from twin.transport.codec import (
     TOPIC_TYPES,
     Item,
     WireError,
+    decode_comparisons,
     decode_item,
     encode_item,
 )
-from twin.transport.endpoint import BLOCK_TOPICS
+from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC
 
 START_TOPIC = RECORD_TOPICS[RunStart]
 # Order of items with the same sample index: start first, then by table of topics, stop last. So a
@@ -45,6 +46,7 @@ START_TOPIC = RECORD_TOPICS[RunStart]
 TOPIC_ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
 TOPIC_ORDER |= {START_TOPIC: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
 CUT_EVENT_KIND = "cut"  # says of which run a recording of some steps is a part
+DECODED_AT_ONCE = 10_000  # comparisons
 MIN_LABEL_BYTES = 3  # of the three labels of a sample, in any encoding
 R = TypeVar("R", bound=Record)
 
@@ -294,10 +296,10 @@ def _decode_messages(
     """Return (decoded messages, errors of those that do not decode); blocks go into `store`."""
     entries: list[_Entry] = []
     errors = []
-    for message in messages:
+    for message, decoded in _iter_decoded(messages):
         topic, payload = message.topic, message.payload
         try:
-            run, item = decode_item(topic, payload)
+            run, item = decoded or decode_item(topic, payload)
         except WireError as error:
             errors.append(str(error))
             continue
@@ -308,6 +310,24 @@ def _decode_messages(
         else:
             entries.append(_Entry(topic, message.sequence, payload, item, run, kept))
     return entries, errors
+
+
+def _iter_decoded(
+    messages: Iterable[LogMessage],
+) -> Iterator[tuple[LogMessage, tuple[str, Item] | None]]:
+    """Yield each message, in any order, with its content where many were decoded at once."""
+    compared: list[LogMessage] = []
+    for message in messages:
+        if message.topic != CMP_TOPIC:
+            yield message, None
+            continue
+        compared.append(message)
+        if len(compared) == DECODED_AT_ONCE:
+            yield from zip(
+                compared, decode_comparisons([each.payload for each in compared]), strict=True
+            )
+            compared = []
+    yield from zip(compared, decode_comparisons([each.payload for each in compared]), strict=True)
 
 
 def _find_start(

@@ -4,6 +4,7 @@ Code that works on a recording may rely on these checks.
 """
 
 import math
+from itertools import chain
 
 from table_io.block import Block, Label
 from table_io.records import (
@@ -97,7 +98,7 @@ def _has_unequal_lengths(record: Record) -> bool:
     match record:
         case Comparison():
             columns = record.measured_ss, record.free_error_ss, record.window_error_ss
-            return any(len(column) != len(record.channels) for column in columns)
+            return {*map(len, columns)} != {len(record.channels)}
         case Agreement():
             parts = record.error, record.band, record.flight, record.right, record.left
             return any(len(column) != len(record.channels) for column in parts)
@@ -118,8 +119,8 @@ def _validate_fields(record: Record) -> str:
         return "columns of unequal lengths"
     match record:
         case Comparison():
-            sums = record.measured_ss, record.free_error_ss, record.window_error_ss
-            if any(value < 0 for column in sums for value in column):
+            sums = chain(record.measured_ss, record.free_error_ss, record.window_error_ss)
+            if any(map((0.0).__gt__, sums)):
                 return "negative sum of squares"
         case CycleExtremes() | Level():
             if record.step > MAX_STEPS:

@@ -139,6 +139,52 @@ def encode_comparisons(comparisons: Sequence[Comparison], run: str) -> list[byte
     return payloads
 
 
+def decode_comparisons(payloads: Sequence[bytes]) -> list[tuple[str, Comparison] | None]:
+    """Decode comparisons as `decode_item` does, at once; None for those that it must decode.
+
+    Those of a run differ in index and sums, which lie at the same places in payloads of one length.
+    """
+    decoded: list[tuple[str, Comparison] | None] = [None] * len(payloads)
+    by_length: dict[int, list[int]] = {}
+    for place, payload in enumerate(payloads):
+        by_length.setdefault(len(payload), []).append(place)
+    for length, places in by_length.items():
+        try:
+            run, first = decode_item(CMP_TOPIC, payloads[places[0]])
+        except WireError:
+            continue
+        if not isinstance(first, Comparison) or encode_item(first, run) != payloads[places[0]]:
+            continue
+        sums = first.measured_ss, first.free_error_ss, first.window_error_ss
+        if {*map(len, sums)} != {len(first.channels)}:
+            continue
+        rows = np.frombuffer(b"".join(payloads[place] for place in places), np.uint8)
+        rows = rows.reshape(-1, length)
+        digits = len(pb.Comparison(index=first.index).SerializeToString())  # with the tag
+        is_free = np.zeros(length, dtype=bool)
+        is_free[1:digits] = True
+        end, size = length - len(encode_run(Comparison, run)), 8 * len(first.channels)
+        header = len(pb.Comparison(measured_ss=first.measured_ss).SerializeToString()) - size
+        columns = []
+        for _ in range(3):
+            is_free[end - size : end] = True
+            columns.append(np.ascontiguousarray(rows[:, end - size : end]).view("<f8").tolist())
+            end -= size + header
+        is_alike = (rows[:, ~is_free] == rows[0, ~is_free]).all(axis=1)
+        varint = rows[:, 1:digits]
+        is_alike &= ((varint & 0x80) == (varint[0] & 0x80)).all(axis=1)
+        weights = 1 << 7 * np.arange(varint.shape[1])
+        indices = ((varint & 0x7F) * weights).sum(axis=1, dtype=np.int64)
+        is_alike &= indices <= MAX_SAMPLE_INDEX
+        for place, alike, index, window, free, measured in zip(
+            places, is_alike.tolist(), indices.tolist(), *columns, strict=True
+        ):
+            if alike:
+                sums = tuple(measured), tuple(free), tuple(window)
+                decoded[place] = run, Comparison(index, first.count, first.channels, *sums)
+    return decoded
+
+
 def strip_run(payload: bytes, kind: type, run: str) -> bytes:
     """Return the payload of an item without its run id, for comparing runs.
 
