@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+from rich.cells import cell_len
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.errors import LiveError
 from rich.markup import escape
@@ -72,6 +73,9 @@ def print_qr_code(text: str) -> None:
 
 def fits_width(on: Console, table: Table) -> bool:
     """Return True if the console is wide enough for every cell of a table in one line."""
+    for column in table.columns:  # once: rich measures every cell again where no width is set
+        texts = (replace_escapes(str(cell)) for cell in (column.header, *column.cells))
+        column.width = max(cell_len(line) for text in texts for line in text.split("\n"))
     return on.measure(table, options=on.options.update(width=FILE_COLUMNS)).maximum <= on.width
 
 
