@@ -1,26 +1,35 @@
 """What the quality pass finds: bad samples and channels planted in clean recordings, and no others.
 
     python -m tests.studies.bad_samples planted     10 kinds x 20 sizes: the share that is found
+    python -m tests.studies.bad_samples fit         parameters with bad samples, and without them
     python -m tests.studies.bad_samples clean 300   false findings on clean recordings
 
 The recordings are those of the laboratory of the study of evidence, which shares no code with the
 product; every instrument of it, 50 Hz to 20 kHz, table tests and component tests.
 """
 
+import re
 import sys
+import tempfile
 import time
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass
 from functools import cache
+from itertools import product
+from pathlib import Path
 
 import numpy as np
+import pytest
 
 from table_io.block import Float1D
 from table_io.channels import CHANNEL_BY_NAME
+from table_io.errors import InputError
 from tests.studies.evidence import laboratory
 from tests.studies.evidence.__main__ import draw_clean_cases, draw_component_cases
+from tests.studies.evidence.imported import format_profile, import_columns
 from tests.studies.evidence.laboratory import StepTest, record, record_component
 from twin.compare.quality import find_bad_samples, find_doubts
+from twin.discovery.task import identify
 from twin.exchange.plausibility import list_implausible
 
 Channels = dict[str, Float1D]
@@ -33,8 +42,10 @@ COMPLETE = (0, 1, 3, 4, 8, 10, 11)
 
 
 @cache
-def make_clean(seed: int, component: bool, rate_hz: float) -> Mapping[str, Float1D]:
-    """Return the channels of a clean recording, (sample,) each."""
+def make_clean(
+    seed: int, component: bool, rate_hz: float, is_long: bool = False
+) -> Mapping[str, Float1D]:
+    """Return the channels of a clean recording, (sample,) each; a long one can be fitted."""
     fine_hz = laboratory.FINE_HZ
     laboratory.FINE_HZ = max(16_000.0 if 16_000.0 % rate_hz == 0.0 else 20_000.0, rate_hz)
     try:
@@ -42,17 +53,21 @@ def make_clean(seed: int, component: bool, rate_hz: float) -> Mapping[str, Float
             case = next(draw_component_cases(range(seed, seed + 1)))
             assert case.component is not None
             hz, amplitudes, _ = case.component
-            seconds = 4.0 if rate_hz >= FAST_HZ else 12.0
+            seconds = 40.0 if is_long else 4.0 if rate_hz >= FAST_HZ else 12.0
             columns = record_component(
                 case.specimen, case.lab, seed, hz, amplitudes, rate_hz, seconds
             )
         else:
             case = next(draw_clean_cases(range(seed, seed + 1)))
-            test = StepTest(2.0, 4.4, 1.2 if rate_hz >= FAST_HZ else 0.8, rate_hz=rate_hz)
-            columns = record(case.specimen, case.lab, seed, replace(test, cycles=6))
+            columns = record(case.specimen, case.lab, seed, _make_test(rate_hz, is_long))
     finally:
         laboratory.FINE_HZ = fine_hz
     return {name: values for name, values in columns.items() if name != "time_s"}
+
+
+def _make_test(rate_hz: float, is_long: bool) -> StepTest:
+    step_hz, cycles = 1.2 if rate_hz >= FAST_HZ else 0.8, 15 if is_long else 6
+    return StepTest(2.0, 4.4, step_hz, cycles=cycles, rate_hz=rate_hz)
 
 
 def list_findings(channels: Mapping[str, Float1D], rate_hz: float) -> set[tuple[str, str]]:
@@ -169,13 +184,33 @@ KINDS = (
 )  # fmt: skip
 
 
-def is_found(kind: str, size: int, seed: int = 0) -> bool:
-    """Return True if a planted fault is found, as what it is or as what looks the same."""
+@dataclass(frozen=True)
+class Planted:
+    """A recording, the same one with a fault in a channel, and which of its samples are bad."""
+
+    seed: int
+    component: bool
+    rate_hz: float
+    clean: Mapping[str, Float1D]
+    bad: Channels
+    name: str
+    at: Float1D
+
+
+def draw_planted(kind: str, size: int, seed: int = 0, is_long: bool = False) -> Planted:
+    """Return a recording with a fault of a kind."""
     rng = np.random.default_rng([seed, size, KINDS.index(kind)])
     component = size % 2 == 0 and not kind.startswith("unit") and kind != "swapped"
-    rate_hz = float(rng.choice(RATES_HZ[1:6]))
-    clean = make_clean((COMPLETE if not component else range(7))[size % 7], component, rate_hz)
-    bad, name, at = plant(kind, size, {**clean}, rate_hz, rng)
+    rate_hz = float(rng.choice(RATES_HZ[3:6] if is_long else RATES_HZ[1:6]))
+    case = (COMPLETE if not component else range(7))[size % 7]
+    clean = make_clean(case, component, rate_hz, is_long)
+    return Planted(case, component, rate_hz, clean, *plant(kind, size, {**clean}, rate_hz, rng))
+
+
+def is_found(kind: str, size: int, seed: int = 0) -> bool:
+    """Return True if a planted fault is found, as what it is or as what looks the same."""
+    planted = draw_planted(kind, size, seed)
+    bad, name, at, rate_hz = planted.bad, planted.name, planted.at, planted.rate_hz
     findings = list_findings(bad, rate_hz)
     if at.any():
         gaps = [g for g in find_bad_samples(bad) if g.channel == name]
@@ -191,22 +226,60 @@ def is_found(kind: str, size: int, seed: int = 0) -> bool:
     return any(finding in wanted for finding, _ in findings)
 
 
-def main(what: str, count: int = 300) -> None:
-    """Print the counts of the study."""
+def fit(planted: Planted, channels: Channels) -> dict[str, tuple[float, float]]:
+    """Return (value, half width) of the parameters identified from an import of channels."""
+    profile = ""
+    if not planted.component:
+        case = next(draw_clean_cases(range(planted.seed, planted.seed + 1)))
+        profile = format_profile(case.specimen, _make_test(planted.rate_hz, is_long=True))
+    time_s = np.arange(len(next(iter(channels.values())))) / planted.rate_hz
+    with tempfile.TemporaryDirectory() as folder:
+        log = import_columns({"time_s": time_s, **channels}, Path(folder), profile)
+        parameters = identify([log]).report.parameters
+    return {
+        name: (each.value, 0.5 * (each.high - each.low))
+        for name, each in parameters.items()
+        if each.low is not None and each.high is not None
+    }
+
+
+def compare_fits(kind: str, size: int, seed: int) -> dict[str, float]:
+    """Return by parameter how far bad samples move it, in half widths of its interval."""
+    planted = draw_planted(kind, size, seed, is_long=True)
+    absent = {name: np.array(values) for name, values in planted.clean.items()}
+    absent[planted.name][planted.at] = np.nan
+    try:
+        without = fit(planted, absent)
+    except InputError as error:  # too little is left
+        with pytest.raises(InputError, match=re.escape(str(error))):
+            fit(planted, planted.bad)
+        return {"refused alike": 0.0}
+    with_bad = fit(planted, planted.bad)
+    return {name: (with_bad[name][0] - value) / half for name, (value, half) in without.items()}
+
+
+def main(what: str, count: int = 0) -> None:
+    """Print the counts of the study: of `count` recordings, or of the seed `count`."""
+    seed = count
     start = time.process_time()
     if what == "clean":
         false = 0
-        for seed in range(count):
-            rate_hz = RATES_HZ[seed % len(RATES_HZ)]
-            clean = make_clean(seed, seed % 3 == 0, rate_hz)
+        for case in range(count):
+            rate_hz = RATES_HZ[case % len(RATES_HZ)]
+            clean = make_clean(case, case % 3 == 0, rate_hz)
             if findings := list_findings(clean, rate_hz):
                 false += 1
-                print(f"seed {seed} at {rate_hz:g} Hz: {sorted(findings)}", flush=True)
+                print(f"seed {case} at {rate_hz:g} Hz: {sorted(findings)}", flush=True)
             make_clean.cache_clear()
         print(f"{false} of {count} clean recordings with a finding")
+    elif what == "fit":
+        for kind, size in product(("clipped", "stuck", "wild"), SIZES):
+            moved = compare_fits(kind, size, seed)
+            worst = max(moved, key=lambda name: abs(moved[name]))
+            print(f"{kind} {size}: {worst} {moved[worst]:+.2f} half widths", flush=True)
     else:
         for kind in KINDS:
-            missed = [size for size in SIZES if not is_found(kind, size)]
+            missed = [size for size in SIZES if not is_found(kind, size, seed)]
             print(
                 f"{kind}: {len(SIZES) - len(missed)} of {len(SIZES)}, missed {missed}", flush=True
             )

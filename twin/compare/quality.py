@@ -51,7 +51,7 @@ MIN_LEVEL_RATIO = 6.0  # of that run over those of the next levels: 4.8 on a qua
 MAX_END_RATIO = 3.0  # of a run at the beginning or end over the others: longer, it is a rest
 MAX_OVERSHOOT = 2.0  # of the range, that speed and length of a flat top foretell: else a dwell
 CLIPPING_NOISE = 1e-4  # of the range, within which a flat top that carries noise stays
-MIN_ENTRY = 10.0  # times that noise, by which a sample enters and leaves such a top: no peak does
+MIN_CUT_OFF = 6.0  # times that noise: height that speeds foretell above such a top; of a peak, 1
 MIN_STUCK_RUN, MIN_STUCK_RATIO = 5, 4.0  # samples; over how long the longest readings last
 LASTING_SHARE = 0.99  # of the readings, which last less
 MIN_STUCK_STEP = 10.0  # resolutions by which a stuck channel is off when it moves again
@@ -290,15 +290,15 @@ def _find_clipped(name: str, values: Float1D) -> list[Span]:
         # between contacts a load cell rests, and has noise there
         is_rest = name in (*RIGHT_CELLS, *LEFT_CELLS) and 2.0 * np.median(depth) < np.ptp(x)
         if not (parts or is_rest):
-            parts = _list_flat_tops(x, np.floor(depth / noise), MIN_ENTRY * noise)
+            parts = _list_flat_tops(x, np.floor(depth / noise), MIN_CUT_OFF * noise)
         spans += [(int(rows[a]), int(rows[b - 1]) + 1) for a, b in parts]
     return sorted(spans)
 
 
-def _list_flat_tops(x: Float1D, depth: Float1D, least_entry: float = 0.0) -> list[Span]:
+def _list_flat_tops(x: Float1D, depth: Float1D, least_height: float = 0.0) -> list[Span]:
     """Return the parts of a signal where its depth below an extreme is 0, if it is cut off there.
 
-    `least_entry`: of the samples before and after them, which are that far apart from the next.
+    `least_height`: of what is cut off, by the speeds before and after it.
     """
     levels = np.unique(depth)
     runs = find_stretches(depth == 0.0)
@@ -315,14 +315,16 @@ def _list_flat_tops(x: Float1D, depth: Float1D, least_entry: float = 0.0) -> lis
     if at_ends > MAX_END_RATIO * max((b - a for a, b in inner), default=0):  # it rests there
         return []
     entries = [
-        (max(abs(x[a - 1] - x[a - 2]), abs(x[b + 1] - x[b])), b - a)
+        (abs(x[a - 1] - x[a - 2]), abs(x[b + 1] - x[b]), 0.25 * (b - a))
         for a, b in inner
         if b - a >= MIN_CLIPPED_RUN
     ]
-    if not entries or np.median([speed for speed, _ in entries]) < least_entry:
+    # A parabola of this speed at its ends and this length has this height.
+    heights = [(length * min(speeds), length * max(speeds)) for *speeds, length in entries]
+    if not heights:
         return []
-    foretold = np.median([0.25 * length * speed for speed, length in entries])
-    return inner if foretold <= MAX_OVERSHOOT * np.ptp(x) else []
+    lowest, highest = np.median(heights, axis=0)
+    return inner if least_height <= lowest and highest <= MAX_OVERSHOOT * np.ptp(x) else []
 
 
 def _find_stuck(channels: Mapping[str, Float1D], name: str) -> list[Span]:

@@ -196,6 +196,8 @@ class LogSignals:
         hz, top = self.omega / (2.0 * np.pi), 0.0
         rate_hz = self.grid.rate_hz / self.grid.decimation
         moving = self.good & (self.label != Label.REST)
+        if not moving.any():  # which whoever fits refuses
+            return float(4.0 * hz[1])
         names = (*RIGHT_CELLS, *LEFT_CELLS, "damper_force_n", "mass_acc_m_s2")
         present = [name for name in names if name in self.spectra]
         for name in present or [name for name in ("table_acc_m_s2",) if name in self.spectra]:
