@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TextIO
 
 from table_io.errors import InputError, format_pip_line
-from table_io.formats.lvm import FIRST_WORDS, parse_lvm
+from table_io.formats.lvm import EXPRESS_WORDS, FIRST_WORDS, parse_express, parse_lvm
 from table_io.formats.sandbox import run_isolated
 from table_io.formats.strong_motion import (
     KNET_WORDS,
@@ -58,6 +58,7 @@ OTHER_TEXTS = {  # what a text is that is not read, by its first characters
     rb"\s*<(!doctype html|html)": "an HTML page", rb"\s*<\?xml": "an XML file",
     rb"\s*(\{\s*[\"}]|\[\s*[\[{])": "a JSON file", rb"\{\\rtf": "an RTF document",
 }  # fmt: skip
+UTF_32_MARKS = (b"\xff\xfe\0\0", b"\0\0\xfe\xff")
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 MIN_ZERO_SHARE = 0.9  # of the upper bytes of a Latin text in UTF-16, if it has no mark
 SNIFF_BYTES = 4096
@@ -102,6 +103,8 @@ def decode_text(data: bytes) -> str:
 
 def _list_encodings(start: bytes) -> tuple[str, ...]:
     """Return the encodings that a text may have, by its first bytes."""
+    if start.startswith(UTF_32_MARKS):
+        return ("utf-32",)
     if start.startswith(UTF_16_MARKS):
         return ("utf-16",)
     for encoding, high in (("utf-16-le", start[1::2]), ("utf-16-be", start[::2])):
@@ -122,7 +125,7 @@ def _scan_text(path: Path, start: bytes) -> ForeignTable:
             "empty", where=path, remedy="give a table with a header and one row per sample"
         )
     encodings = _list_encodings(start)
-    is_binary = b"\0" in start and not encodings[0].startswith("utf-16")
+    is_binary = b"\0" in start and not encodings[0].startswith(("utf-16", "utf-32"))
     kinds = [
         kind for mark, kind in OTHER_SIGNATURES.items() if start.startswith(mark) and is_binary
     ]
@@ -142,7 +145,9 @@ def _scan_text(path: Path, start: bytes) -> ForeignTable:
             continue
         notes = () if encoding == "utf-8-sig" else (f"its text is in {encoding}",)
         return replace(table, notes=(*notes, *table.notes))
-    raise InputError("a text in UTF-16 that is damaged", where=path, remedy="export it again")
+    raise InputError(
+        f"a text in {encodings[0]} that is damaged", where=path, remedy="export it again"
+    )
 
 
 def _parse_lines(file: TextIO, path: Path) -> ForeignTable:
@@ -157,6 +162,8 @@ def _parse_lines(file: TextIO, path: Path) -> ForeignTable:
         return parse_peer(file, path)
     if is_volume_2(path.name):
         return parse_volume_2(file, path)
+    if first.lower().startswith(EXPRESS_WORDS):
+        return parse_express(file, path)
     return parse_lvm(file, path) if first.startswith(FIRST_WORDS) else parse_table(file, path)
 
 

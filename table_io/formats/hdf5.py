@@ -12,6 +12,7 @@ from typing import Any
 import h5py
 import numpy as np
 
+from table_io.errors import InputError
 from table_io.formats.table import (
     MAX_MATRIX_COLUMNS,
     TOML_TEXTS,
@@ -24,6 +25,8 @@ from table_io.formats.words import LABEL_FIELDS, UNIT_FIELDS, add_fact, find_fac
 Attributes = Mapping[str, str | list[str]]
 Fields = Iterable[tuple[str, Any, Attributes]]
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
+FILL_ATTRIBUTES = ("_FillValue", "missing_value")
+START_ATTRIBUTES = ("start_time", "start_s", "t0")  # numbers in s
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
 MAX_REFERENCES = 1000  # of a cell array
 
@@ -45,7 +48,17 @@ def load_column(path: Path, key: ColumnKey) -> Any:
     """Read the values of a column, (row,)."""
     name, part, k = key
     with h5py.File(path, "r") as file:
-        return extract_column(file[name][part or ()], int(k))
+        values = extract_column(file[name][part or ()], int(k))
+        return _unpack(values, {key: file[name].attrs[key] for key in file[name].attrs})
+
+
+def _unpack(values: Any, attributes: Mapping[str, Any]) -> Any:
+    """Return values with the scale of the CF conventions, as netCDF has it; NaN for fillings."""
+    if not attributes.keys() & {*FILL_ATTRIBUTES, "scale_factor", "add_offset"}:
+        return values
+    lost = [attributes[key] for key in FILL_ATTRIBUTES if key in attributes]
+    numbers = np.where(np.isin(values, lost), np.nan, values)
+    return attributes.get("scale_factor", 1.0) * numbers + attributes.get("add_offset", 0.0)
 
 
 def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
@@ -72,9 +85,13 @@ def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
             name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0]
         )
         rate_hz = _find_rate(item)
+        starts = [item.attrs[key] for key in START_ATTRIBUTES if key in item.attrs]
+        start_s = next((float(start) for start in starts if np.isreal(start).all()), 0.0)
         for column in (name, *(f"{name}:{k}" for k in range(1, MAX_MATRIX_COLUMNS + 1))):
             if rate_hz and column in table.columns:
-                table.columns[column] = replace(table.columns[column], rate_hz=rate_hz)
+                table.columns[column] = replace(
+                    table.columns[column], rate_hz=rate_hz, start_s=start_s
+                )
 
 
 def _find_rate(item: Any) -> float | None:
@@ -88,6 +105,13 @@ def _find_rate(item: Any) -> float | None:
                 number = np.asarray(value).reshape(-1)[0]
                 if np.issubdtype(type(number), np.number):
                     add_fact(facts, fact, float(number))
+        if "other_rate_hz" in facts:
+            raise InputError(
+                f"an HDF5 file; {place.name} states {facts['rate_hz']:.9g} Hz and "
+                f"{facts['other_rate_hz']:.9g} Hz",
+                where=item.file.filename,
+                remedy="correct its attributes",
+            )
         if facts or place.name == "/":
             return facts.get("rate_hz")
         place = place.parent

@@ -7,7 +7,7 @@ no row has numbers alone, a column may hold text or times of day.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -26,19 +26,23 @@ LOST_MARKS = {
     "na", "n/a", "#n/a", "null", "-", "--", "---", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#qnan",
     "1.#ind", "-1.#ind",
 }  # fmt: skip
+RULE = re.compile(r"[-=_]{2,}")  # below a head
 # A minus sign, an apostrophe, and blanks that do not break, between thousands.
 PLAIN_MARKS = str.maketrans({"−": "-", "’": "'", "\u00a0": "'", "\u202f": "'", "\u2009": "'"})
 # With marks of thousands that cannot be decimal commas: 1,234.5 and 1'234.
 THOUSANDS = re.compile(r"\s*[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:'\d{3})+(?:\.\d*)?)\s*")
+COMMA_THOUSANDS = re.compile(r"\s*[-+]?\d{1,3}(?:\.\d{3})+,\d*\s*")  # 1.234,5
 ROW_WORDS = ("TS", "RN")  # units of a time stamp and of a row number, in loggers of Campbell
 # Line below the units of those loggers: how the samples of a column were reduced.
 REDUCTIONS = {"", "Smp", "Avg", "Tot", "Max", "Min", "Std"}
+START_ROW = re.compile(r"\W*(?:t0|start[ _]?times?)\W*", re.IGNORECASE)
 UNIT_LINE = re.compile(r"\W*units?\s*[:=]\s*(\S+)", re.IGNORECASE)
 HOUR_S, DAY_S = 3600.0, 86400.0
 MINUTES = re.compile(r"(\d\d?):(\d\d[.,]\d+)")  # and seconds, as spreadsheets show short times
+# Date, or days since the start, and time; its milliseconds may follow a colon: 23:59:59:500.
 CLOCK = re.compile(
-    r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+)?"
-    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+)?))? ?([AP]M)?(Z|[-+]\d\d:?\d\d)?",
+    r"(?:(\d{1,4})([-/.])(\d\d?)[-/.](\d{1,4})[ T]+|(\d+) days? )?"
+    r"(\d\d?):(\d\d)(?::(\d\d(?:[.,]\d+|:\d{3})?))? ?([AP]M)?(Z|[-+]\d\d:?\d\d)?",
     re.IGNORECASE,
 )
 
@@ -100,11 +104,25 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
     if units == ("",):  # of a single column a line of its own may state the unit
         stated = [match[1] for line in remarks if (match := UNIT_LINE.match(line))]
         units = tuple(normalize_unit(unit) for unit in stated[:1]) or units
-    facts = read_facts(remarks)
+    facts = read_facts(remarks) | _compare_starts([rows[k] for k in above])
     samples = sum(_is_alike(kinds[k].ljust(len(kind)), kind) for k in filled[first:])
     spare = names[len(kind) :]
     head = frozenset(map(strip_cells, rows[:index]))
     return TableLayout(names[: len(kind)], units, index, kind, commas, spare, samples, facts, head)
+
+
+def _compare_starts(rows: Iterable[Sequence[str]]) -> dict[str, float]:
+    """Return as a fact how far the starts of channels are apart in s, if a row states them."""
+    for row in rows:
+        starts = [cell.strip() for cell in row[1:] if cell.strip()]
+        if START_ROW.fullmatch(row[0]) and len({*starts}) > 1:
+            clock = ClockReader()
+            try:
+                times = [clock(cell) for cell in starts]
+            except ValueError:
+                times = [np.nan]
+            return {"starts_apart_s": float(np.ptp(times))}
+    return {}
 
 
 def _find_numbers(
@@ -186,7 +204,7 @@ def _fit_names(row: Sequence[str], width: int) -> tuple[str, ...]:
 
     A name more than columns is that of a last column without cells, such as remarks.
     """
-    cells = [cell.strip().rstrip(": ") for cell in _strip_end(row)]
+    cells = [" ".join(cell.split("\n")).strip().rstrip(": ") for cell in _strip_end(row)]
     if row[0].startswith(CONVERTED_MARK):
         return ()
     if cells and cells[0] and cells[0][0] in COMMENT_MARKS:
@@ -219,9 +237,9 @@ def _strip_end(row: Sequence[str]) -> Sequence[str]:
 def _find_kind(cell: str, commas: bool) -> str:
     """Return the kind of a cell: n number, c time of day, t text, or a blank if it is empty."""
     text = cell.strip()
-    if not text or text.lower() in LOST_MARKS:
+    if not text or text.lower() in LOST_MARKS or RULE.fullmatch(text):
         return " "
-    if is_number(text.replace(",", ".") if commas else text):
+    if is_number(use_decimal_point(text) if commas else text):
         return "n"
     return "c" if CLOCK.fullmatch(text) or MINUTES.fullmatch(text) else "t"
 
@@ -233,6 +251,12 @@ def is_number(cell: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def use_decimal_point(cell: str) -> str:
+    """Return a number with a decimal comma, as 1.234,5 too, as one with a point."""
+    is_marked = COMMA_THOUSANDS.fullmatch(cell)
+    return (cell.replace(".", "") if is_marked else cell).replace(",", ".", 1)
 
 
 def parse_number(cell: str) -> float:
@@ -251,10 +275,11 @@ def parse_number(cell: str) -> float:
 def _has_decimal_commas(rows: Sequence[Sequence[str]]) -> bool:
     """Return True if most numbers outside of remarks that have a decimal sign have a comma."""
     filled = [[cell.strip() for cell in row if cell.strip()] for row in rows]
-    numbers = [row for row in filled if all(is_number(cell.replace(",", ".", 1)) for cell in row)]
+    numbers = [row for row in filled if all(is_number(use_decimal_point(cell)) for cell in row)]
     cells = [cell for row in (numbers if any(numbers) else filled) for cell in row]
     points = sum("." in cell and is_number(cell) for cell in cells)
-    return sum(DECIMAL_COMMA.fullmatch(cell) is not None for cell in cells) > points
+    commas = (DECIMAL_COMMA.fullmatch(cell) or COMMA_THOUSANDS.fullmatch(cell) for cell in cells)
+    return sum(match is not None for match in commas) > points
 
 
 class ClockReader:
@@ -275,11 +300,12 @@ class ClockReader:
             if text:
                 raise ValueError(text)
             return float("nan")
-        first, mark, second, third, hours, minutes, seconds, half, zone = match.groups()
+        first, mark, second, third, days, hours, minutes, seconds, half, zone = match.groups()
         hour = int(hours)
         if half:
             hour = hour % 12 + 12 * (half.upper() == "PM")
-        time_s = 3600.0 * hour + 60.0 * int(minutes) + float((seconds or "0").replace(",", "."))
+        time_s = DAY_S * int(days or 0) + 3600.0 * hour + 60.0 * int(minutes)
+        time_s += float(re.sub("[,:]", ".", seconds or "0"))
         if zone and zone not in "Zz":
             ahead_s = 3600.0 * int(zone[1:3]) + 60.0 * int(zone[-2:])
             time_s += ahead_s if zone[0] == "-" else -ahead_s

@@ -1,12 +1,13 @@
-"""Reader of LabVIEW measurement files, .lvm: text with a header a file and a header a segment.
+"""Readers of the texts of LabVIEW: measurement files, .lvm, and exports of SignalExpress.
 
-Source: NI, "Specification for the LabVIEW Measurement File (.lvm)", version 2. The last cell of a
-row may be a comment.
+An .lvm has a header a file and a header a segment; the last cell of a row may be a comment. Source:
+NI, "Specification for the LabVIEW Measurement File (.lvm)", version 2. SignalExpress writes a key
+such as `dt:` in a line, and below it a cell a channel.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 from typing import TextIO
 
@@ -14,10 +15,12 @@ import numpy as np
 
 from table_io.errors import InputError
 from table_io.formats.cells import read_cells
-from table_io.formats.layout import TableLayout, is_number
+from table_io.formats.layout import ClockReader, TableLayout, is_number, parse_number
 from table_io.formats.table import ForeignColumn, ForeignTable, make_column
 
 FIRST_WORDS = "LabVIEW Measurement"
+EXPRESS_WORDS = "channel names:"
+EXPRESS_KIND = "a text of LabVIEW SignalExpress"
 KIND = "a LabVIEW measurement file (.lvm)"
 HEADER_END = "***End_of_Header***"
 SEPARATORS = {"Tab": "\t", "Comma": ","}
@@ -67,6 +70,36 @@ def parse_lvm(file: TextIO, path: Path) -> ForeignTable:
         }
     note = f"{len(segments)} segments, each one is a group: time does not go on"
     return replace(table, columns=columns, notes=(note,))
+
+
+def parse_express(file: TextIO, path: Path) -> ForeignTable:
+    """Read an export of SignalExpress: names, starts and intervals of channels, then samples."""
+    rows = [[cell.strip() for cell in line.rstrip().split("\t")] for line in file]
+    keys = {row[0].lower(): rows[k + 1] for k, row in enumerate(rows[:-1]) if row[0][-1:] == ":"}
+    names, intervals = keys[EXPRESS_WORDS], keys.get("dt:", [])
+    first = next((k for k, row in enumerate(rows, 1) if row[0].lower() == "data:"), len(rows))
+    if not all(map(is_number, intervals)) or first == len(rows):
+        raise InputError(
+            f"{EXPRESS_KIND} without samples, or with an interval that is no number",
+            where=path,
+            remedy="export TDMS or CSV",
+        )
+    clock = ClockReader()
+    try:
+        starts_s = [clock(cell) for cell in keys.get("start times:", [])]
+    except ValueError as error:
+        raise InputError(f"{EXPRESS_KIND}: {error} is no time", where=path) from None
+    layout = TableLayout((*names,), ("",) * len(names), first, "n" * len(names))
+    samples = ((number, row) for number, row in enumerate(rows, 1) if number > first and any(row))
+    table = read_cells(path, EXPRESS_KIND, layout, samples)
+    for name, cell, start_s in zip_longest(names, intervals, starts_s):
+        if name in table.columns and cell is not None and parse_number(cell) > 0.0:
+            table.columns[name] = replace(
+                table.columns[name],
+                rate_hz=1.0 / parse_number(cell),
+                start_s=0.0 if start_s is None else start_s - starts_s[0],
+            )
+    return table
 
 
 def _goes_on(before: Columns, after: Columns) -> bool:

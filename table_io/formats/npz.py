@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from table_io.formats.table import ColumnKey, ForeignTable, extract_column
+from table_io.formats.words import add_fact, find_fact
 
 
 def scan_columns(path: Path) -> ForeignTable:
@@ -24,6 +25,9 @@ def scan_columns(path: Path) -> ForeignTable:
                 shape, _, dtype = header(file)
             name = member.removesuffix(".npy")
             table.add_array(name, shape, dtype.kind, (name,))
+            if (fact := find_fact(name)) and dtype.kind in "fiu" and {*shape} <= {1}:
+                with np.load(path, allow_pickle=False) as arrays:
+                    add_fact(table.facts, fact, float(arrays[name].item()))
     return table
 
 

@@ -7,7 +7,9 @@ import numpy as np
 from nptdms import TdmsFile
 
 from table_io.formats.table import ColumnKey, ForeignColumn, ForeignTable
+from table_io.formats.words import UNIT_FIELDS
 
+UNIT_KEYS = ("unit_string", *UNIT_FIELDS)
 SECOND = np.timedelta64(1, "s")
 
 
@@ -36,7 +38,7 @@ def scan_columns(path: Path) -> ForeignTable:
                 table.columns[name] = ForeignColumn(
                     len(channel),
                     (group.name, channel.name),
-                    str(properties.get("unit_string", "")),
+                    next((str(properties[key]) for key in UNIT_KEYS if key in properties), ""),
                     1.0 / step if step > 0 else None,
                     (begins.get((group.name, channel.name), first) - first) / SECOND
                     + float(properties.get("wf_start_offset", 0.0)),

@@ -59,10 +59,12 @@ def _find_layout(head: list[str]) -> tuple[str, TableLayout | None]:
     fits = {}
     for delimiter in DELIMITERS:
         try:
-            rows = _separate_words(head) if delimiter == BLANKS else _separate(head, delimiter)
-            layout = find_layout([*rows])
+            rows, first_lines = _separate_head(head, delimiter)
         except csv.Error:
             continue
+        layout = find_layout(rows)
+        if layout is not None:
+            layout = replace(layout, first_row=first_lines[layout.first_row])
         if layout is not None and layout.spare and delimiter == BLANKS:  # a remark of as many words
             layout = replace(layout, names=(), units=("",) * layout.width, spare=())
         # "1,2" is two cells, unless other delimiters separate several numbers like it
@@ -80,11 +82,23 @@ def _rank_layout(layout: TableLayout) -> tuple[bool, bool, int, bool, int]:
     return "t" not in layout.kinds, is_full, layout.samples, bool(layout.names), layout.width
 
 
+def _separate_head(head: list[str], delimiter: str) -> tuple[list[list[str]], list[int]]:
+    """Return (cells, index of the first line) of each row: a cell in quotes may hold several."""
+    if delimiter == BLANKS:
+        return [*_separate_words(head)], [*range(len(head))]
+    reader = csv.reader(head, delimiter=delimiter, skipinitialspace=True)
+    rows, first_lines = list[list[str]](), [0]
+    for row in reader:
+        rows.append(row)
+        first_lines.append(reader.line_num)
+    return rows, first_lines[:-1]
+
+
 def _separate(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     """Yield the cells of each line; none for an empty line."""
     if delimiter == BLANKS:
         return (line.split() for line in lines)
-    return csv.reader(lines, delimiter=delimiter)
+    return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
 
 
 def _separate_words(lines: Iterable[str]) -> Iterator[list[str]]:

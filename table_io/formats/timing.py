@@ -14,7 +14,12 @@ from table_io.block import Float1D, Int1D
 from table_io.channels import TIME_COLUMN
 from table_io.errors import InputError
 from table_io.formats.table import ForeignColumn, ForeignTable
-from table_io.formats.words import TIME_UNITS, find_quantity, find_stated_unit
+from table_io.formats.words import (
+    TIME_UNITS,
+    find_quantity,
+    find_stated_unit,
+    find_unknown_unit,
+)
 
 MAX_JITTER_SAMPLES = 0.2  # rms deviation from the uniform grid, in samples
 MAX_INTERVAL_ERROR = 0.01  # of the mean interval, of times that a machine is to follow
@@ -73,6 +78,9 @@ def find_time_column(table: ForeignTable, names: Sequence[str]) -> str:
 
 def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
     """Return what is wrong with a column that is one of times by its name, "" without one."""
+    for name, why in table.dropped.items():
+        if find_quantity(name) == "time":
+            return f"column {name!r} is {why}"
     for name in names:
         if find_quantity(name, table.columns[name].unit) == "time":
             try:
@@ -80,6 +88,24 @@ def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
             except InputError as error:
                 return f"column {name!r}: {error.where.rpartition(': ')[2]}: {error.problem}"
     return ""
+
+
+def find_remark_rate(table: ForeignTable) -> float | None:
+    """Return the rate in Hz that remarks in a file without times state, None without.
+
+    InputError if they state two, one that is hardly that of a test, or channels that start apart.
+    """
+    rate_hz, other_hz = (table.facts.get(key) for key in ("rate_hz", "other_rate_hz"))
+    problem = ""
+    if "starts_apart_s" in table.facts:
+        problem = f"its channels start {table.facts['starts_apart_s']:.9g} s apart"
+    elif rate_hz and other_hz:
+        problem = f"its remarks state {rate_hz:.9g} Hz and {other_hz:.9g} Hz"
+    elif rate_hz and rate_hz < MIN_PLAIN_RATE_HZ:
+        problem = f"its remarks state {rate_hz:.9g} Hz, perhaps in another unit"
+    if problem:
+        raise InputError(f"{table.kind}; {problem}", where=table.path, remedy="state the rate")
+    return rate_hz
 
 
 def describe_other_times(table: ForeignTable, names: Sequence[str], chosen: str) -> str:
@@ -113,6 +139,8 @@ def judge_time_unit(table: ForeignTable, name: str, stated_hz: float | None = No
     unit = find_stated_unit(name, table.columns[name].unit)
     if unit in TIME_UNITS:
         return TimeUnit(unit, "stated in the file")
+    unknown = unit or find_unknown_unit(name)
+    is_known = unknown in ("", "-") or (unknown.isalpha() and not unit)
     times = table.read_column(name)
     step = float(np.median(np.diff(times)))
     known_hz = stated_hz or table.facts.get("rate_hz")
@@ -126,10 +154,10 @@ def judge_time_unit(table: ForeignTable, name: str, stated_hz: float | None = No
         whose = "stated" if stated_hz else "file's"
         return TimeUnit(SAMPLE_UNIT, f"counts samples, at the {whose} {known_hz:g} Hz")
     for unit, date in _find_dates(float(times[0])).items():
-        if MIN_PLAIN_RATE_HZ <= rates.get(unit, 0.0) <= MAX_RATE_HZ:
+        if is_known and MIN_PLAIN_RATE_HZ <= rates.get(unit, 0.0) <= MAX_RATE_HZ:
             since = "1899-12-30" if unit == "day" else "1970"
             return TimeUnit(unit, f"counts {unit} since {since}, from {date}; no unit is stated")
-    if not is_count and _is_in_seconds(table, name, rates.get("s", 0.0)):
+    if is_known and not is_count and _is_in_seconds(table, name, rates.get("s", 0.0)):
         return TimeUnit("s", f"a step of {step:.4g} s; no unit is stated")
     possible = [
         f"{rate_hz:.4g} Hz in {unit}"
@@ -139,7 +167,8 @@ def judge_time_unit(table: ForeignTable, name: str, stated_hz: float | None = No
     return TimeUnit(
         "s",
         f"a step of {step:.4g}",
-        f"column {name!r}: the unit of its times is not stated, a step of {step:.4g} is "
+        f"column {name!r}: the unit of its times is not "
+        f"{f'known, {unknown!r}' if unknown else 'stated'}, a step of {step:.4g} is "
         f"{' or '.join(possible) or 'no rate of a test'}"
         f"{', or it counts samples' if is_count else ''}: state it in a map, or --rate HZ",
     )
@@ -222,11 +251,12 @@ def resolve_times(
     else:
         times = _resolve_column(time, table, stated_hz)
     check_plausible_rate(times.rate_hz, table, times.source)
-    file_hz = table.facts.get("rate_hz")
+    file_rates = [table.facts[key] for key in ("rate_hz", "other_rate_hz") if key in table.facts]
     is_settled = time is not None and stated_hz is not None
-    if file_hz and not is_settled and abs(times.rate_hz / file_hz - 1.0) > MAX_INTERVAL_ERROR:
+    differ = [hz for hz in file_rates if abs(times.rate_hz / hz - 1.0) > MAX_INTERVAL_ERROR]
+    if differ and len(differ) == len(file_rates) and not is_settled:
         raise InputError(
-            f"{table.kind}; it states {file_hz:.9g} Hz, but {times.source} tells "
+            f"{table.kind}; it states {differ[0]:.9g} Hz, but {times.source} tells "
             f"{times.rate_hz:.9g} Hz",
             where=table.path,
             remedy="find out which one is right: state rate_hz in a map if it is that of the "
@@ -378,8 +408,7 @@ def _resolve_stated_rate(
             rate_hz = _round_rate(file_hz, size)
             source = "the file"
             notes.append(f"sampled at {rate_hz:.9g} Hz, as stated in the file")
-    elif rate_hz is None and "rate_hz" in table.facts:
-        rate_hz = table.facts["rate_hz"]
+    elif rate_hz is None and (rate_hz := find_remark_rate(table)):
         source = "a remark in the file"
         notes.append(f"sampled at {rate_hz:.9g} Hz, by a remark in the file")
     if rate_hz is None:

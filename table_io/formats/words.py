@@ -15,8 +15,9 @@ UNIT_SPELLINGS = {
     "newton": "N", "newtons": "N", "n": "N", "kn": "kN", "kips": "kip", "lb": "lbf", "lbs": "lbf",
     "pounds": "lbf", "volt": "V", "volts": "V", "v": "V", "mv": "mV",
     "°c": "degC", "degc": "degC", "celsius": "degC",
-    "sec": "s", "second": "s", "seconds": "s", "msec": "ms", "millisecond": "ms",
-    "milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "minute": "min",
+    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "msecs": "ms",
+    "millisecond": "ms", "milliseconds": "ms", "usec": "us", "usecs": "us", "microsecond": "us",
+    "microseconds": "us", "nsec": "ns", "nanoseconds": "ns", "minute": "min",
     "minutes": "min", "mins": "min", "h": "hour", "hr": "hour", "hours": "hour", "d": "day",
     "days": "day",
 }  # fmt: skip
@@ -25,10 +26,14 @@ TIME_UNITS = {
 }  # fmt: skip
 KNOWN_UNITS = {*UNITS, *TIME_UNITS, "Hz", "-"}
 AMBIGUOUS_ENDINGS = ("d", "h")  # of a name: "acc_d" is not in days
+BRACKETS = re.compile(r"\(([^()]+)\)|\[([^\[\]]+)\]|\{([^{}]+)\}|<([^<>]+)>")
+# Of a unit, such as 10^3, x1000, 1e-3 and 1/100: with one of them the name tells no unit.
+FACTOR = re.compile(r"\d\s*(?:\^|\*\*)|(?<!\*)[*×]\s*\d|\bx\s?10+\b|\d[eE][-+]?\d|\b1/\d")
 MASS_UNITS_KG = {"kg": 1.0, "t": 1e3, "ton": 1e3, "tons": 1e3, "tonnes": 1e3, "lb": 0.45359237}
 FACT_NAMES = {
     "rate_hz": (
-        r"(?:sampling|sample|scan|acquisition)[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"
+        r"(?:sampling|sample|scan|acquisition|export|output|storage|logging|recording)"
+        r"[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"
         r"|samples[ _]*per[ _]*second|abtast(?:rate|frequenz)"
     ),
     "interval_s": (
@@ -37,6 +42,7 @@ FACT_NAMES = {
     ),
     "mass_kg": r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg",
 }
+RATE_SPREAD = 0.01  # of rates that are the same, one of them by an interval with few digits
 NUMBER = r"[-+]?\d+(?:[.,]\d+)?(?:[eE][-+]?\d+)?"
 QUANTITY_WORDS = {
     "time": {"t", "time", "timestamp", "elapsed", "zeit", "tempo", "temps", "tiempo"},
@@ -74,23 +80,36 @@ def is_unit(text: str) -> bool:
 
 
 def find_unit(name: str) -> str:
-    """Return the unit at the end of a column name, as "load [kN]", "load/kN" or "load in kN"."""
+    """Return the unit in brackets in a column name, or at its end: "load/kN" or "load in kN"."""
     text = find_bracketed(name)
+    if FACTOR.search(name):
+        return ""
     if not text and (match := re.fullmatch(r"(.*\w)(?:\s*/\s*| in )([^/\s]+)", name.strip())):
         text = "" if is_unit(split_words(match[1])[-1]) else match[2]  # m/s is one unit
     return normalize_unit(text) if is_unit(text) else ""
 
 
 def find_bracketed(name: str) -> str:
-    """Return what stands in brackets at the end of a column name, or ""."""
-    match = re.search(r"[(\[]([^()\[\]]+)[)\]][\s:]*$", name)
-    return match[1].strip() if match else ""
+    """Return the unit in brackets in a column name, else what its last brackets hold, or ""."""
+    texts = ["".join(filter(None, match.groups())).strip() for match in BRACKETS.finditer(name)]
+    units = [text for text in texts if is_unit(text)]
+    return units[0] if len({*map(normalize_unit, units)}) == 1 else "".join(texts[-1:])
+
+
+def find_unknown_unit(name: str) -> str:
+    """Return what stands for a unit in a column name and is none, such as "10 N" and "daN"."""
+    text = find_bracketed(name)
+    if is_unit(text):
+        return name if FACTOR.search(name) else ""
+    is_factor = re.search(r"\d", text) and any(map(is_unit, re.findall(r"[^\W\d_]+", text)))
+    return text if is_factor or text.isalpha() or text == "%" else ""
 
 
 def find_stated_unit(name: str, unit: str = "") -> str:
     """Return the unit of a column by the file, or by the end of its name (acc_m_s2), or ""."""
     stated = normalize_unit(unit) or find_unit(name)
-    if stated:
+    # In brackets with more than a unit, that may be a factor on it: "(10 mm)".
+    if stated or re.search(r"\d", find_bracketed(name)) or FACTOR.search(name):
         return stated
     words = re.split(r"[^a-zA-Z0-9/²]+", name.strip(" )]"))
     if len(words) > 2 and is_unit("/".join(words[-2:])):
@@ -151,21 +170,33 @@ def read_facts(lines: Iterable[str]) -> dict[str, float]:
             brackets = r"(?:[(\[]([^)\]]*)[)\]])?"
             pattern = rf"(?i)(?<!\w)(?:{names})\s*{brackets}\s*[:=,;\s]\s*({NUMBER})\s*([a-z]*)"
             if match := re.search(pattern, line):
-                value = float(match[2].replace(",", "."))
-                add_fact(facts, key, value, match[1] or match[3])
+                add_fact(facts, key, _parse(match[2]), match[1] or match[3])
+                if re.fullmatch(rf"(?:\s+{NUMBER})+\s*", rest := line[match.end() :]):
+                    for word in rest.split():  # of further channels
+                        add_fact(facts, key, _parse(word), match[1])
     return facts
 
 
+def _parse(number: str) -> float:
+    return float(number.replace(",", "."))
+
+
 def add_fact(facts: dict[str, float], key: str, value: float, unit: str = "") -> None:
-    """Add a fact in SI: `rate_hz`, `mass_kg`, or the rate of an `interval_s`."""
+    """Add a fact in SI: `rate_hz`, `mass_kg`, or the rate of an `interval_s`.
+
+    A second rate that differs is `other_rate_hz`.
+    """
     if value <= 0:
         return
     if key == "mass_kg":
         facts[key] = value * MASS_UNITS_KG.get(unit.lower(), 1.0)
-    elif key == "interval_s":
-        facts.setdefault("rate_hz", 1.0 / (value * TIME_UNITS.get(normalize_unit(unit), 1.0)))
+        return
+    if key == "interval_s":
+        rate_hz = 1.0 / (value * TIME_UNITS.get(normalize_unit(unit), 1.0))
     else:
-        facts["rate_hz"] = value * (1e3 if unit.lower() == "khz" else 1.0)
+        rate_hz = value * (1e3 if unit.lower() == "khz" else 1.0)
+    if abs(facts.setdefault("rate_hz", rate_hz) / rate_hz - 1.0) > RATE_SPREAD:
+        facts["other_rate_hz"] = rate_hz
 
 
 def find_fact(name: str) -> str:

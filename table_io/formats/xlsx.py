@@ -73,12 +73,11 @@ def _read_sheet(sheet: Any, formula_sheet: Any, path: Path) -> ForeignTable | No
 
 
 def _iter_rows(rows: Iterator[list[str]], before: int, width: int) -> Iterator[CellRow]:
-    """Yield (row number, cells) until the first empty row: below it there is no sample."""
+    """Yield (row number, cells) of the rows that are not empty in the columns of the table."""
     for number, row in enumerate(rows, before + 1):
         cells = (row + [""] * width)[:width]
-        if not any(cell.strip() for cell in cells):
-            return
-        yield number, cells
+        if any(cell.strip() for cell in cells):
+            yield number, cells
 
 
 def _format_cell(cell: object) -> str:

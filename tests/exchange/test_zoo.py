@@ -103,6 +103,10 @@ def lvm(x_columns: str, mark: str = "\t", decimal: str = ".", segments: int = 1)
 MTS = "MTS793|MPT|ENU|1|2|.|/|:|1|0|0|A\n\nData Acquisition:\tTimed\t\tTime:\t1.2\tSec\t29/03/2026"
 CATMAN = "HBM_CATMANSOFTWARE 5.2\nT - worksheet\nDATUM\t29.03.2026\nNummer der Kanaele\t3"
 TOA5 = '"TOA5","CR6","CR6","1234","CR6.Std.10","CPU:test.CR6","9999","Fast"'
+EXPRESS = (
+    "channel names:\nDisp (mm)\tForce (N)\nstart times:\n28/03/2026 23:59:59.5\t"
+    "28/03/2026 23:59:59.5\ndt:\n0.005000\t0.005000\n"
+)
 GOOD: dict[str, str | bytes] = {
     "plain.csv": text("Time (s),Disp (mm),Force (N)"),
     "square.csv": text("Time [s],Disp [mm],Force [N]"),
@@ -237,6 +241,30 @@ GOOD: dict[str, str | bytes] = {
     ),
     "no_line_feed.csv": text("Time (s),Disp (mm),Force (N)").rstrip(),
     "footer_no_line_feed.csv": text("Time (s),Disp (mm),Force (N)", tail="End"),
+    "signal_express.txt": EXPRESS + text(
+        "data:", ((u, f) for _, u, f in ROWS), mark="\t"
+    ),
+    "line_feeds.csv": text('"Test 17,\nsecond"\n"Time\n(s)","Disp\n(mm)","Force\n(N)"'),
+    "german_thousands.csv": "\n".join(
+        ["Zeit [s];Weg [µm];Kraft [N]"]
+        + [f"{t:.4f};{1e3 * u:,.4f};{f:.7f}".translate(str.maketrans(",.", ".,"))
+           for t, u, f in ROWS]
+    ),
+    "colon_before_ms.csv": with_stamps(
+        "Time,Disp (mm),Force (N)", lambda d, k: f"{d:%H:%M:%S}:{d.microsecond // 1000:03d}"
+    ),
+    "timedelta.csv": with_stamps(
+        "Time,Disp (mm),Force (N)", lambda d, k: f"0 days 00:00:{k / 200:09.6f}"
+    ),
+    "blank_before_quote.csv": text('"Time (s)", "Disp (mm)", "Force (N)"', mark=", "),
+    "unit_inside_name.csv": text("Time (s) Run #1,[mm] Disp,Force {N}"),
+    "ruled.txt": text(
+        "  Time   Disp   Force\n  (sec)   (mm)    (N)\n ------ ------ ------", mark="  "
+    ),
+    "utf32.csv": text("Time (s),Disp (mm),Force (N)").encode("utf-32"),
+    "two_rates_one_right.csv": text(
+        "Sampling rate: 1000 Hz\nExport rate: 200 Hz\nTime (s),Disp (mm),Force (N)"
+    ),
     "one.lvm": lvm("One"), "no.lvm": lvm("No"), "multi.lvm": lvm("Multi"),
     "comma.lvm": lvm("One", mark=","), "decimal.lvm": lvm("One", decimal=","),
     "segments.lvm": lvm("One", segments=3), "segments_no.lvm": lvm("No", segments=2),
@@ -274,6 +302,47 @@ BAD: dict[str, tuple[str | bytes, str]] = {
     "cut_off.csv": (text("Time (s),Disp (mm),Force (N)")[:-9], "cut off"),
     "unknown_unit.csv": (with_scales("Time (s),Disp (mil),Force (N)", 39.37, 1.0), "'mil'"),
     "unknown_force.csv": (with_scales("Time (s),Disp (mm),Force (daN)", 1.0, 0.1), "'daN'"),
+    "ten_newtons.csv": (with_scales("Time (s),Disp (mm),Force (10 N)", 1.0, 0.1), "'10 N'"),
+    "thousandfold.csv": (with_scales("Time (s),Disp (mm),Force (N) x1000", 1.0, 1e-3), "x1000"),
+    "hundredths.csv": (with_scales("Time (s),Disp (1/100 mm),Force (N)", 1e2, 1.0), "'1/100 mm'"),
+    "hundredths_of_seconds.csv": (
+        with_times("Time (1/100 s),Disp (mm),Force (N)", 1e2 * TIME), "'1/100 s'"
+    ),
+    "two_units.csv": (text("Time (s),Disp (m),Force (N)\ns,mm,N"), "states m, but its unit mm"),
+    "interval_in_ms.txt": (
+        text("dt = 5\nDisp (mm)\tForce (N)", ((u, f) for _, u, f in ROWS), mark="\t"), "0.2 Hz"
+    ),
+    "two_rates_stated.csv": (
+        text(
+            "Sampling rate: 1000 Hz\nExport rate: 200 Hz\nDisp (mm),Force (N)",
+            ((u, f) for _, u, f in ROWS),
+        ),
+        "1000 Hz and 200 Hz",
+    ),
+    "starts_apart.txt": (
+        text(
+            "waveform\t[0]\t[1]\nt0\t23:59:59.5\t23:59:57\ndelta t\t0.005\t0.005\n"
+            "Disp (mm)\tForce (N)", ((u, f) for _, u, f in ROWS), mark="\t",
+        ),
+        "2.5 s apart",
+    ),
+    "express_starts.txt": (
+        EXPRESS.replace("59.5\nd", "57.0\nd")
+        + text("data:", ((u, f) for _, u, f in ROWS), mark="\t"),
+        "start at -2.5 s and 0 s",
+    ),
+    "hidden_thousands.csv": (
+        "\n".join(
+            ["Zeit;Weg [µm];Kraft [N]"]
+            + [f"{START + timedelta(seconds=t):%H:%M:%S.%f};{300 * u:,.0f};{f:.7f}"
+               .replace(",", "-").replace(".", ",").replace("-", ".", 1) for t, u, f in ROWS]
+        ),
+        "thousands",
+    ),
+    "frames.csv": (
+        with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"00:00:{k // 25:02d}:{k % 25:02d}"),
+        "'Time' is text",
+    ),
     "backwards.csv": (text("Time (s),Disp (mm),Force (N)", reversed(ROWS)), "time"),
     "twice.csv": (text("Time (s),Disp (mm),Force (N)", [*ROWS, *ROWS]), "time must rise"),
     "two_clocks.csv": (

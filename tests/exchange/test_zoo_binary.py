@@ -83,10 +83,17 @@ def fill_attributes(file: Any) -> None:
         file[f"run/{name}"].attrs["units"] = unit
 
 
-def fill_rate(file: Any, **attributes: float) -> None:
+def fill_scaled(file: Any) -> None:
+    fill_rate(file, fs=200.0)
+    file["run/force"][:] = (FORCE_N - 2.0) / 0.5
+    file["run/force"].attrs.update({"scale_factor": 0.5, "add_offset": 2.0})
+
+
+def fill_rate(file: Any, force_start_s: float = 0.0, **attributes: float) -> None:
     for name, values, unit in (("disp", DISP_MM, "mm"), ("force", FORCE_N, "N")):
         file[f"run/{name}"] = values
         file[f"run/{name}"].attrs["unit"] = unit
+    file["run/force"].attrs["start_time"] = force_start_s
     for key, value in attributes.items():
         file["run"].attrs[key] = value
 
@@ -166,6 +173,12 @@ GOOD: dict[str, Write] = {
     "time.tdms": write_tdms(
         ("Time", TIME, {"unit_string": "s"}), DISP_TDMS, FORCE_TDMS
     ),
+    "unit_property.tdms": write_tdms(
+        ("Disp", DISP_MM, {"Unit": "mm"} | AT_200_HZ), ("Force", FORCE_N, {"Unit": "N"} | AT_200_HZ)
+    ),
+    "empty_row.xlsx": write_sheets(("D", [*NUMBERS[:99], [], *NUMBERS[99:]])),
+    "scaled.h5": write_hdf5(fill_scaled),
+    "fs.npz": lambda path: np.savez(path, fs=200.0, disp_mm=DISP_MM, force_N=FORCE_N),
     "arrays.npz": lambda path: np.savez(path, time_s=TIME, disp_mm=DISP_MM, force_N=FORCE_N),
 }  # fmt: skip
 BAD: dict[str, tuple[Write, str]] = {
@@ -178,6 +191,16 @@ BAD: dict[str, tuple[Write, str]] = {
     "slow_force.tdms": (
         write_tdms(DISP_200_HZ, ("Force", FORCE_N[::4], {"wf_increment": 0.02} | IN_N)),
         "'Force' has 60 rows at 50 Hz, others 240 at 200 Hz",
+    ),
+    "tenfold.tdms": (
+        write_tdms(("Disp", DISP_MM, {"unit_string": "10 mm"} | AT_200_HZ), FORCE_200_HZ), "'10 mm'"
+    ),
+    "starts.h5": (write_hdf5(lambda file: fill_rate(file, 1.5, rate_hz=200.0)), "0 s and 1.5 s"),
+    "two_rates.h5": (
+        write_hdf5(lambda file: fill_rate(file, fs=200.0, dt=0.001)), "1000 Hz and 200 Hz"
+    ),
+    "two_rates.mat": (
+        write_mat(fs=200.0, dt=0.001, disp_mm=DISP_MM, force_N=FORCE_N), "200 Hz and 1000 Hz"
     ),
     "texts.parquet": (write_parquet(note=["a"] * ROW_COUNT), "with no column of numbers"),
     "unnamed.npz": (lambda path: np.savez(path, TIME, DISP_MM), "no column is known"),

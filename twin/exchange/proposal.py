@@ -13,6 +13,7 @@ import numpy as np
 
 from table_io.block import Float1D
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, TIME_COLUMN
+from table_io.errors import InputError
 from table_io.formats.table import ForeignTable
 from table_io.formats.timing import (
     MAX_INTERVAL_ERROR,
@@ -20,13 +21,15 @@ from table_io.formats.timing import (
     check_rate,
     describe_other_times,
     describe_unusable_times,
+    find_remark_rate,
     find_time_column,
     judge_time_unit,
 )
 from table_io.formats.words import (
-    find_bracketed,
     find_quantity,
     find_stated_unit,
+    find_unit,
+    find_unknown_unit,
     matches_words,
     split_words,
 )
@@ -143,7 +146,7 @@ def propose_map(
     """
     stated = {key: float((settings or {})[key]) for key in FACT_KEYS if key in (settings or {})}
     file_hz = table.facts.get("rate_hz")
-    if "rate_hz" in stated and file_hz:
+    if "rate_hz" in stated and file_hz and "other_rate_hz" not in table.facts:
         check_rate(
             stated["rate_hz"], file_hz, table.path, table.kind, MAX_INTERVAL_ERROR, "rate_hz"
         )
@@ -182,10 +185,10 @@ def propose_map(
     file_rate_hz = next((info.rate_hz for info in infos if info.rate_hz), None)
     has_time = bool(time_column or file_rate_hz) or any(info.clock for info in infos)
     counts_samples = bool(columns) and columns[0].unit == SAMPLE_UNIT
-    rate_hz = table.facts.get("rate_hz") if counts_samples or not has_time else None
-    if not has_time and rate_hz is None:
-        wrong = describe_unusable_times(table, names)
-        questions.append(f"{wrong or 'no times and no sampling rate in the file'}: state --rate HZ")
+    rate_hz = stated.get("rate_hz") if counts_samples or not has_time else None
+    if rate_hz is None and (counts_samples or not has_time):
+        rate_hz, question = _find_rate(table, names)
+        questions += [question] if question else []
     questions += _ask_other_sampling(table, names)
     if not chosen:
         questions.append("no column is known by its name or unit: state the columns in a map")
@@ -204,6 +207,17 @@ def propose_map(
         dropped=_list_dropped(table, names),
         alternatives=alternatives,
     )
+
+
+def _find_rate(table: ForeignTable, names: list[str]) -> tuple[float | None, str]:
+    """Return (rate in Hz that the file states, question) of a table without usable times."""
+    try:
+        if rate_hz := find_remark_rate(table):
+            return rate_hz, ""
+        wrong = describe_unusable_times(table, names) or "no times and no sampling rate in the file"
+    except InputError as error:
+        wrong = error.problem
+    return None, f"{wrong}: state --rate HZ"
 
 
 def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:
@@ -281,12 +295,14 @@ def _propose_unit(
     stated = find_stated_unit(name, table.columns[name].unit)
     if name == channel:
         return "", "its name", ""
+    if find_unit(name) not in ("", stated):
+        return "", "", f"column {name!r} states {find_unit(name)}, but its unit {stated}: which?"
     if stated in allowed:
         return stated, "stated in the file", ""
     if stated in UNITS and UNITS[stated][0] == "V":
         return "", "in volts", f"column {name!r} is in volts: state its gain in the map, SI per V"
-    text = find_bracketed(name)
-    if text.isalpha() and not any(matches_words([text.lower()], w) for w in BODY_WORDS.values()):
+    text = find_unknown_unit(name) or table.columns[name].unit.strip("- ")
+    if text and not any(matches_words([text.lower()], words) for words in BODY_WORDS.values()):
         return "", "", (
             f"column {name!r}: its unit {text!r} is not known; state one of {', '.join(allowed)}"
         )  # fmt: skip

@@ -42,6 +42,8 @@ from table_io.formats.timing import (
     MAX_INTERVAL_ERROR,
     check_plausible_rate,
     check_rate,
+    find_remark_rate,
+    judge_time_unit,
     measure_rate,
 )
 from table_io.formats.words import (
@@ -429,12 +431,16 @@ def _find_rate(
     stated_hz = 1.0 / request.step_s if request.step_s else None
     rate_hz, source = table.columns[column].rate_hz, table.kind
     if time_name:
-        unit = find_stated_unit(time_name, table.columns[time_name].unit)
-        rate_hz = measure_rate(TIME_UNITS.get(unit, 1.0) * table.read_column(time_name), table)
+        per_unit = measure_rate(table.read_column(time_name), table)
+        judged = judge_time_unit(table, time_name, stated_hz)
+        if judged.question:
+            raise InputError(f"{name}: {table.kind}; {judged.question}")
+        count_hz = stated_hz or table.facts.get("rate_hz", 1.0)  # of a column that counts samples
+        rate_hz = per_unit / TIME_UNITS.get(judged.unit, 1.0 / count_hz)
         source = f"column {time_name}"
         check_plausible_rate(rate_hz, table, source)
     elif rate_hz is None:
-        rate_hz = stated_hz or table.facts.get("rate_hz")
+        rate_hz = stated_hz or find_remark_rate(table)
     if rate_hz is None:
         raise InputError(
             f"{name}: {table.kind} without times, its columns are {', '.join(table.columns)}",
