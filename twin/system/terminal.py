@@ -26,8 +26,7 @@ FILE_COLUMNS = 400  # of output to a file or pipe, where lines need no wrapping
 
 def _console_columns() -> int | None:
     """Return the columns of standard output, or None to ask the terminal or COLUMNS."""
-    is_set = os.environ.get("COLUMNS", "").isdigit()
-    return None if sys.stdout.isatty() or is_set else FILE_COLUMNS
+    return None if sys.stdout.isatty() or os.environ.get("COLUMNS", "").isdigit() else FILE_COLUMNS
 
 
 class SafeConsole(Console):
