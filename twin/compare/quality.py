@@ -314,13 +314,11 @@ def _list_flat_tops(x: Float1D, depth: Float1D, least_height: float = 0.0) -> li
     at_ends = max((b - a for a, b in runs if a == 0 or b == x.size), default=0)
     if at_ends > MAX_END_RATIO * max((b - a for a, b in inner), default=0):  # it rests there
         return []
-    entries = [
-        (abs(x[a - 1] - x[a - 2]), abs(x[b + 1] - x[b]), 0.25 * (b - a))
+    heights = [  # of parabolas as long as each part, with the speeds at its ends
+        0.25 * (b - a) * np.sort(np.abs([x[a - 1] - x[a - 2], x[b + 1] - x[b]]))
         for a, b in inner
         if b - a >= MIN_CLIPPED_RUN
     ]
-    # A parabola of this speed at its ends and this length has this height.
-    heights = [(length * min(speeds), length * max(speeds)) for *speeds, length in entries]
     if not heights:
         return []
     lowest, highest = np.median(heights, axis=0)
