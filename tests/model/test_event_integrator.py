@@ -152,6 +152,16 @@ def test_no_effect_creates_energy(model, seed):
     assert before < 0.999 * first
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_mass_that_was_exactly_at_rest_starts_in_either_direction(sign):
+    """u' = -A t at first, as from a step; a law of u' moves the mass by rounding before it."""
+    model = having(find_effect("appendage"), base=snm(math.inf))
+    _, out = drive(model, sign * np.r_[np.zeros(20), np.ones(4)])
+    expected = -sign * (np.arange(4) + 0.5) / 2000.0
+    assert out[1, 20:] == pytest.approx(expected, rel=0.01)
+    assert not out[1, :20].any()
+
+
 def test_friction_holds_the_mass_until_it_is_overcome():
     """Held exactly still, slips when M A reaches Fc, and never trembles."""
     model = having(find_effect("coulomb_friction"), base=snm(math.inf))

@@ -405,6 +405,8 @@ def advance_step(
         x, start = apply_event(guard, x, start, p, laws)
         count = log_event(events, count, begin + t, guard, start)
     u, v, u_r, u_l, f, b_r, b_l, s = x
+    # At rest the laws see u' = REVERSAL_SPEED_M_S; the force of what that moves has no sign.
+    u, v = flush_value(u), flush_value(v)
     f, b_r, b_l = flush_value(f), flush_value(b_r), flush_value(b_l)
     s = flush_states(s)
     may_stretch = p.has_bumper_states or p.pull > 0.0
