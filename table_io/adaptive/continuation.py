@@ -205,10 +205,18 @@ def _relative_position(orbit: PlannedOrbit, reference: Float1D, frequency_hz: fl
     return np.array([reference[1] / size, reference[2] / size, frequency])
 
 
-def correct_target(plan: OrbitPlan, target: OrbitTarget, measured: OrbitMeasurement) -> OrbitTarget:
-    """Return the target after one Newton step with Broyden's derivative."""
+def correct_target(
+    plan: OrbitPlan,
+    target: OrbitTarget,
+    measured: OrbitMeasurement,
+    table_change: Float1D | float = 0.0,
+) -> OrbitTarget:
+    """Return the target after one Newton step with Broyden's derivative.
+
+    `table_change` are the harmonics of x in m by which the command will change the table.
+    """
     orbit = plan.points[target.position]
-    residual = _free_motion(orbit, measured) - target.reference
+    residual = _free_motion(orbit, measured, table_change) - target.reference
     slopes = target.slopes
     if (
         target.last_change is not None
@@ -272,9 +280,11 @@ def _bounded_jacobian(orbit: PlannedOrbit) -> Float2D:
     return bounded
 
 
-def _free_motion(orbit: PlannedOrbit, measured: OrbitMeasurement) -> Float1D:
-    """Return the harmonics of x that the motion would have without the feedback, in m."""
-    table = pack_harmonics(unpack_harmonics(measured.feedback) * measured.response)
+def _free_motion(
+    orbit: PlannedOrbit, measured: OrbitMeasurement, table_change: Float1D | float
+) -> Float1D:
+    """Return the harmonics of x in m without the feedback, after a change of the table."""
+    table = pack_harmonics(unpack_harmonics(measured.feedback) * measured.response) - table_change
     return measured.x - _bounded_jacobian(orbit) @ table - table
 
 

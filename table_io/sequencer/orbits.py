@@ -28,6 +28,7 @@ from table_io.adaptive.continuation import (
     plan_target,
     planned_reference,
     rotate_harmonics,
+    table_harmonics,
 )
 from table_io.adaptive.result import mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
@@ -87,11 +88,8 @@ def begin_continuation(state: SequencerState) -> SequencerState:
     config, response = _config(state), state.tuning.response
     plan = config.orbit_plan
     target = plan_target(plan, 0, ())
-    lag_s, correction = 0.0, 1.0
     records = state.records
     if response is not None:
-        lag_s = _find_lag(response, target.frequency_hz)
-        correction = 1.0 / abs(evaluate_transfer(response, target.frequency_hz))
         timing = (
             f"the table answers {1e3 * measure_latency(state):.1f} ms after a block; the gains are "
             f"for {1e3 * plan.latency_s:.1f} ms and a jitter of {1e3 * plan.jitter_s:g} ms"
@@ -101,8 +99,6 @@ def begin_continuation(state: SequencerState) -> SequencerState:
         FeedbackState(state.plan.feedback_horizon),
         target,
         (),
-        lag_s,
-        correction,
         since=state.trajectory.end,
     )
     state = replace(state, search=search, records=records)
@@ -147,6 +143,18 @@ def _find_lag(response: FrequencyResponse, frequency_hz: float) -> float:
     """Return the lag in s of the table behind its command."""
     transfer = evaluate_transfer(response, frequency_hz)
     return -math.atan2(transfer.imag, transfer.real) / (2 * math.pi * frequency_hz)
+
+
+def _find_table_lag(state: SequencerState, frequency_hz: float) -> float:
+    """Return the lag in s of the table behind its command, as the last orbit corrected it."""
+    response, change_s = state.tuning.response, _search(state).lag_change_s
+    return change_s if response is None else change_s + _find_lag(response, frequency_hz)
+
+
+def _find_correction(state: SequencerState, frequency_hz: float) -> float:
+    """Return the factor on the command that gives the level, as the last orbit corrected it."""
+    response, factor = state.tuning.response, _search(state).level_factor
+    return factor if response is None else factor / abs(evaluate_transfer(response, frequency_hz))
 
 
 def _config(state: SequencerState) -> Continuation:
@@ -209,18 +217,20 @@ def _append_orbit(
     blend_cycles: float,
 ) -> tuple[Trajectory, FeedbackState]:
     """Return the trajectory and the references with a blend to an orbit appended."""
-    search, config = _search(state), _config(state)
+    config = _config(state)
     reference, frequency_hz, step, share = waypoint
     if feedback.segments and trajectory.target.level_m_s2 and feedback.segments[-1].share1 < share:
         trajectory, feedback = _engage(trajectory, feedback, step, blend_cycles)
     orbit, start = config.orbit_plan.points[step], trajectory.end
     from_rest = trajectory.target.level_m_s2 == 0.0
-    sine = SineTarget(frequency_hz, orbit.acceleration_m_s2, search.correction)
+    correction = _find_correction(state, frequency_hz)
+    sine = SineTarget(frequency_hz, orbit.acceleration_m_s2, correction)
     trajectory = trajectory.append_blend(sine, step, blend_cycles, Label.BLEND)
     count = math.ceil(blend_cycles * trajectory.rate_hz / frequency_hz)
     if not from_rest and trajectory.end - start < count:
         trajectory = trajectory.append_hold(count - trajectory.end + start, step, Label.BLEND)
-    after = rotate_harmonics(reference, -2 * math.pi * frequency_hz * search.lag_s)
+    lag_s = _find_table_lag(state, frequency_hz)
+    after = rotate_harmonics(reference, -2 * math.pi * frequency_hz * lag_s)
     command_m = sine.corrected_m_s2 / (2 * math.pi * frequency_hz) ** 2
     segment = ReferenceSegment(
         start,
@@ -310,15 +320,15 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     w = 2 * math.pi * target.frequency_hz
     nominal = complex(table.amplitudes[0] + w**2 * response[1] * fits[2].amplitudes[0])
     lag_angle = math.atan2(nominal.imag, nominal.real)
-    played = rotate_harmonics(
-        target.reference, -2 * math.pi * target.frequency_hz * search.lag_s - lag_angle
-    )
+    lag_s = _find_table_lag(state, target.frequency_hz)
+    late_s = -lag_angle / (2 * math.pi * target.frequency_hz) - lag_s
+    played = rotate_harmonics(target.reference, 2 * math.pi * target.frequency_hz * late_s)
     target = replace(target, reference=played)
     u, x, feedback = (rotate_harmonics(_to_vector(fit), -lag_angle) for fit in fits)
     measured = OrbitMeasurement(u, x, feedback, response)
     search = replace(
         search,
-        lag_s=-lag_angle / (2 * math.pi * target.frequency_hz),
+        lag_change_s=search.lag_change_s + late_s,
         target=target,
         is_captured=True,
         periods=search.periods
@@ -332,9 +342,7 @@ def decide_orbit(state: SequencerState) -> SequencerState:
             f"{1e3 * fundamental(orbit.harmonics_m):.2g} mm"
         )
         return retry_orbit(replace(state, search=search), stage.last, reason)
-    command_m = (
-        orbit.acceleration_m_s2 * search.correction / (2 * math.pi * target.frequency_hz) ** 2
-    )
+    command_m = orbit.acceleration_m_s2 * _find_correction(state, target.frequency_hz) / w**2
     noise_m = (
         abs(orbit.gain)
         * fits[1].residual_rms
@@ -370,10 +378,14 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         state = replace(state, search=search, records=(*state.records, point))
         return _next_orbit(state)
     factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
+    # The motion is corrected for the level that the table will have, not for that which it had.
+    table_change = table_harmonics(
+        target.frequency_hz, (factor - 1.0) * abs(nominal), plan.harmonics
+    )
     search = replace(
         search,
-        target=correct_target(plan, target, measured),
-        correction=search.correction * factor,
+        target=correct_target(plan, target, measured, table_change),
+        level_factor=search.level_factor * factor,
     )
     return _approach(
         replace(state, search=search), state.trajectory, (), blend_cycles=UPDATE_BLEND_CYCLES

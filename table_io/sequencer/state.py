@@ -72,16 +72,16 @@ class ReleaseSeries:
 class OrbitSearch:
     """Continuation so far: feedback, the orbit sought and those measured.
 
-    `lag_s` is the lag of the table behind its command, `correction` the factor on the command,
-    `losses` count at this point, `lost_points` since the last accepted orbit, and `periods` since
-    the change of point, up to sample `since`.
+    Beyond the table's response in the loop check `lag_change_s` is the lag behind the command, and
+    `level_factor` the factor on it. `losses` count at this point, `lost_points` since the last
+    accepted orbit, and `periods` since the change of point, up to sample `since`.
     """
 
     feedback: FeedbackState
     target: OrbitTarget
     measured: tuple[MeasuredOrbit, ...]
-    lag_s: float
-    correction: float
+    lag_change_s: float = 0.0
+    level_factor: float = 1.0
     losses: int = 0
     lost_points: int = 0
     is_captured: bool = False

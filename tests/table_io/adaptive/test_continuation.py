@@ -75,6 +75,22 @@ def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
     assert target.frequency_hz == f
 
 
+def test_step_is_for_the_level_that_the_table_will_have() -> None:
+    """The table was 3 % too low while the motion was held."""
+    f, ratio = 3.4, linear_response(3.4, 200e3)
+    jacobian = real_matrix(ratio)
+    table = table_harmonics(f, A, 1)
+    u = jacobian @ table
+    plan = OrbitPlan(
+        harmonics=1, latency_s=0.046, points=(make_orbit(f, complex(u[1], u[2]), jacobian),)
+    )
+    target = plan_target(plan, 0, ())
+    measured = hold(target.reference, 0.97 * (u + table), jacobian, 0.5 - 0.3j)
+    target = correct_target(plan, target, measured, 0.03 * table)
+    np.testing.assert_allclose(target.reference, u + table, atol=1e-12)
+    assert target.frequency_hz == f
+
+
 def test_broyden_corrects_a_wrong_jacobian() -> None:
     f, ratio = 3.4, linear_response(3.4, 200e3)
     table = table_harmonics(f, A, 1)
