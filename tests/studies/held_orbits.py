@@ -21,7 +21,7 @@ from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
 from table_io.errors import InputError
-from table_io.records import OrbitPoint, RunStop
+from table_io.records import Event, OrbitPoint, RunStop
 from table_io.units import GRAVITY_M_S2
 from twin.setup.run_config import RunConfig, read_run_config
 
@@ -57,6 +57,7 @@ class HeldTest:
     bound_m_s2: float
     level_m_s2: float
     is_whole: bool  # every sample was delivered
+    rejections: tuple[str, ...]  # of orbits, with their reasons
 
     @property
     def peak_m_s2(self) -> float:
@@ -88,6 +89,7 @@ def play(
     backend.queue = record  # type: ignore[method-assign]
     progress = [0]  # samples so far
     accepted, stop, is_whole, correction = 0, None, True, 1.0
+    rejections: list[str] = []
     for item in run_session(
         config.session_setup, backend, clock, config.make_start_factory("held", "table"),
         lambda: operate(progress[0]), take_back=find_take_back(backend, clock),
@@ -97,9 +99,13 @@ def play(
             progress[0] = item.end
         elif isinstance(item, OrbitPoint):
             accepted += item.accepted
+            if not item.accepted:
+                rejections.append(f"orbit {item.step} at {item.frequency_hz:.3f} Hz, {item.reason}")
             # A table that follows with a gain below 1 takes a larger command for its level.
             command_m_s2 = item.command_m * (math.tau * item.frequency_hz) ** 2
             correction = max(correction, command_m_s2 / item.acceleration_m_s2)
+        elif isinstance(item, Event) and item.kind == "lost":
+            rejections.append(item.text)
         elif isinstance(item, RunStop):
             stop = item
     assert stop is not None
@@ -111,7 +117,7 @@ def play(
     return HeldTest(
         accepted, len(continuation.orbit_plan.points), stop.verdict, stop.reason, command_m,
         config.drive.rate_hz, bound * correction, continuation.acceleration_g * GRAVITY_M_S2,
-        is_whole and stop.index == end,
+        is_whole and stop.index == end, tuple(rejections),
     )  # fmt: skip
 
 
@@ -143,8 +149,8 @@ def try_starts(folder: Path, count: int, points: int) -> None:
             print(
                 f"{index:>3} {rig} {start:.3f} Hz {test.accepted} of {test.planned}, "
                 f"{test.verdict} {test.reason if not is_reached else ''}",
-                flush=True,
-            )
+                *(() if is_reached else test.rejections), sep="\n    ", flush=True,
+            )  # fmt: skip
     print(f"{reached} reached, {refused} refused before motion, of {2 * count}")
 
 
