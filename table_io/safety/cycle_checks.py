@@ -392,6 +392,8 @@ def phase_lag_s(ratio: complex, omega: float) -> float:
     return float(-np.angle(ratio)) / omega
 
 
+MIN_FREE_SAMPLES = 5  # without contact, in a cycle
+MIN_TENSION_RATIO = 2.0  # of the pulses of compression, above which a cell is reversed
 MIN_SWING_SIGMAS = 20.0  # times the noise: force from which sharing is evaluated
 BASELINE_CHECKS = 20  # ten cycles with contact, over which the baseline is averaged
 MAX_ANGLE_CHANGE_RAD = math.radians(3.0)  # a tenth more or less force on one of two cells
@@ -431,10 +433,14 @@ def check_cell_pairs(
     for side, sign, gap in ((RIGHT_CELLS, 1.0, gaps[0]), (LEFT_CELLS, -1.0, gaps[1])):
         present = [name for name in side if cycle.has(name)]
         if u is not None and gap > 0:
-            bearing = list(_check_unloaded_cells(cycle, present, sign * u < 0))
+            free = sign * u < 0
+            bearing = list(_check_unloaded_cells(cycle, present, free))
             suspicions += (
                 bearing if len(bearing) < max(len(present), 2) else [_suspect_displacement(bearing)]
             )
+            if reversed_cells := [name for name in present if _shows_tension(cycle, name, free)]:
+                suspicions.append(_suspect_polarity(cycle, reversed_cells))
+                continue
         if len(present) < 2:
             continue
         noise = max(cycle.sigma(name) for name in side)
@@ -456,7 +462,7 @@ def _check_unloaded_cells(
     With a positive gap there is no contact then.
     """
     count = int(free.sum())
-    if count < 5:
+    if count < MIN_FREE_SAMPLES:
         return
     for name in names:
         force = float(cycle.clean_channel(name)[free].mean())
@@ -464,6 +470,26 @@ def _check_unloaded_cells(
         limit += 6.0 * cycle.sigma(name) / math.sqrt(count)
         if abs(force) > limit:
             yield suspect_drift(name, force, limit, "N")
+
+
+def _shows_tension(cycle: DriveCycle, name: str, free: npt.NDArray[np.bool_]) -> bool:
+    """Return whether a cell shows pulses of tension, from its mean where its side is `free`."""
+    if int(free.sum()) < MIN_FREE_SAMPLES:
+        return False
+    force = cycle.clean_channel(name)
+    unloaded = float(force[free].mean())
+    least = max(cycle.context.profile.comparison.contact_n, MIN_SWING_SIGMAS * cycle.sigma(name))
+    tension = unloaded - float(force.min())
+    return tension > max(least, MIN_TENSION_RATIO * (float(force.max()) - unloaded))
+
+
+def _suspect_polarity(cycle: DriveCycle, names: list[str]) -> Suspicion:
+    tension = max(-float(cycle.clean_channel(name).min()) for name in names)
+    text = (
+        f"{' and '.join(names)} in tension where the bumper presses, {format_si(tension, 'N')}: "
+        "turn the cells around, or change the sign of volts_per_unit in the rig file"
+    )
+    return Suspicion("polarity", names[0], -tension, 0.0, text)
 
 
 def _suspect_displacement(suspicions: list[Suspicion]) -> Suspicion:

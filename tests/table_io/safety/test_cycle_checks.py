@@ -517,6 +517,25 @@ def test_five_samples_without_contact_show_the_force_of_a_cell(
     assert check_cell_pairs(pushed, {side[0]: ForceShare(0.0, (500.0, 0.0))})[0] == []
 
 
+@SIDES
+@given(offset=st.floats(-4.0, 4.0), peak=st.floats(50.0, 5e3))
+@MANY
+def test_cells_in_tension_where_the_bumper_presses_are_reversed(
+    side: tuple[str, str], direction: float, offset: float, peak: float
+) -> None:
+    u = direction * 0.01 * WAVE
+    pulses = peak * np.clip(direction * u / 0.01 - 0.5, 0.0, None)
+    for signs in ((1.0, 1.0), (-1.0, 1.0), (1.0, -1.0), (-1.0, -1.0)):
+        cells = {name: offset + sign * pulses for name, sign in zip(side, signs, strict=True)}
+        suspicions, _ = check_cell_pairs(make_cycle({"mass_disp_m": u, **cells}), {})
+        wrong = [name for name, sign in zip(side, signs, strict=True) if sign < 0]
+        assert [item.kind for item in suspicions] == ["polarity"] * bool(wrong)
+        assert all(name in suspicions[0].text for name in wrong)
+    # A sticking surface pulls less than it was pressed.
+    sticky = {name: pulses - 0.2 * np.roll(pulses, CYCLE_SAMPLES // 16) for name in side}
+    assert check_cell_pairs(make_cycle({"mass_disp_m": u, **sticky}), {})[0] == []
+
+
 def share_force(
     side: tuple[str, str],
     angle: float,

@@ -332,7 +332,8 @@ def list_motion_faults() -> Iterator[Fault]:
     for share in (0.5, 0.35, 0.6):
         for row, factor in ((R1, 1.3), (R2, 0.7), (R1, -1.0), (R2, 0.1)):
             yield Fault(f"{NAMES[row]} times {factor}, share {share}",
-                        press_bumper(share, multiply(row, factor)), "share", None, True, 3100)
+                        press_bumper(share, multiply(row, factor)),
+                        "polarity" if factor < 0 else "share", None, True, 3100)
     yield Fault("gap elsewhere", press_bumper(0.5, add(MASS, -4e-3)), "drift", MASS, True, 9999)
     # fmt: on
 

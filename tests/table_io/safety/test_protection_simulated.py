@@ -79,7 +79,7 @@ FAULTS: tuple[tuple[dict[str, Any], set[str], bool, float], ...] = (
     ({"kind": "gain", "channel": "force_r2_n", "size": 0.25}, {"share"}, True, 2.0),
     ({"kind": "polarity", "channel": "table_disp_m"}, {"following"}, True, 0.3),
     ({"kind": "polarity", "channel": "mass_disp_m"}, {"consistency", "drift"}, True, 1.5),
-    ({"kind": "polarity", "channel": "force_l1_n"}, {"share", "drift"}, True, 2.0),
+    ({"kind": "polarity", "channel": "force_l1_n"}, {"polarity", "drift"}, True, 2.0),
     ({"kind": "rail", "channel": "table_acc_m_s2"}, {"acceleration", "rail"}, True, 0.02),
     ({"kind": "drift", "channel": "table_disp_m", "size": 1.0}, {"following", "drift"}, True, 1.5),
     ({"kind": "drift", "channel": "mass_acc_m_s2", "size": 0.01}, {"drift"}, True, 3.0),
