@@ -130,6 +130,8 @@ class PassiveProtection:
             return (Event(index, "check", "no command is wired: the loop check is not evaluated"),)
         checks, response = loop_check.evaluate(block, drive, profile, rig, self.noise)
         records: list[Record] = [replace(check, index=index) for check in checks]
+        notices = filter(None, map(loop_check.find_notice, checks))
+        records += [Event(index, "instrument", text) for text in notices]
         if response is not None:
             response = replace(response, index=index)
             records.append(response)

@@ -55,6 +55,8 @@ MIN_LARGE_SHARE = 0.01  # of the samples, which change by so much: more than the
 MIN_TONE_SNR = 10.0  # tone over its standard error
 DELAY_RANGE_MS = (-2.0, 100.0)
 MAX_DELAY_SPREAD_RATIO = 0.5  # of the mean delay, if that is more than the rig's limit
+BEYOND_NOISE = "difference beyond noise from"
+MAX_UNNOTICED_PERCENT = 0.5  # of the motion, by which calibrated sensors of one body differ
 MAX_READ_BACK_LSB, MAX_READ_BACK_RATIO = 4.0, 0.005  # DAC steps, and fraction of the command
 MIN_NOISE_MARGIN_DB = 20.0
 KNOWN_SIGMAS = 4.0  # by which the noise of a short rest may be more than that of the rig file
@@ -68,6 +70,7 @@ MAX_LEAD_SINE = -0.5
 # Tone of the mass: at least this in phase with the table, at most this in antiphase.
 MIN_IN_PHASE_TONE = 0.5
 MAX_ANTIPHASE_TONE = 0.9
+NO_LIMITS = (-math.inf, math.inf)
 MIN_FLOOR_MOTION = 0.3  # of the table's tone, in what the laser of the mass reads
 
 
@@ -267,18 +270,20 @@ def check_derivative_consistency(data: LoopCheckData) -> Iterator[Check]:
     """Compare the second derivative of each displacement with the acceleration of the same body.
 
     One number for errors of gain, sign, unit and time: |ratio - 1| of the weak form, the largest
-    over all frequencies with low enough noise. It holds for any motion of the specimen. The low cut
-    and delay of a sound accelerometer are fitted before.
+    over all frequencies with low enough noise, and what noise does not explain of it. It holds for
+    any motion of the specimen. The low cut and delay of a sound accelerometer are fitted before.
     """
     for displacements, acceleration in SENSOR_PAIRS:
         if not _has_clear_tone(data, *displacements, acceleration):
             continue
         if displacements[0] == "mass_disp_m" and not _list_absolute(data, displacements[:1]):
             continue
-        mismatch, _ = data.compare_sensors(displacements, acceleration)
+        mismatch, excess, _ = data.compare_sensors(displacements, acceleration)
         if not math.isnan(mismatch):
             name, high = f"second derivative against {acceleration}", 100.0 * MAX_MISMATCH_RATIO
             yield make_check(data, name, displacements[0], 100.0 * mismatch, 0.0, high, "%")
+            name = f"{BEYOND_NOISE} {acceleration}"
+            yield make_check(data, name, displacements[0], 100.0 * excess, *NO_LIMITS, "%")
 
 
 def check_noise(data: LoopCheckData) -> Iterator[Check]:
@@ -407,7 +412,6 @@ MIN_NOISE_RATIO = 0.1  # of the noise stated in the rig file
 MIN_LOADED_SNR = 50.0  # tone over its standard error above which a cell counts as loaded
 MIN_FORCE_SHARE = 0.1  # of the force of the other cell on the same side
 MAX_CROSS_TALK_RATIO = 0.5  # of the contact threshold
-NO_LIMITS = (-math.inf, math.inf)
 
 
 def check_load_cells(data: LoopCheckData) -> Iterator[Check]:
@@ -622,6 +626,19 @@ def evaluate(
 def find_remedy(check: Check) -> str:
     """Return the remedy for a failed check; empty if there is none."""
     return next((text for name, text in REMEDIES.items() if check.name.startswith(name)), "")
+
+
+def find_notice(check: Check) -> str:
+    """Return what the operator is told of a check that passed; empty if nothing."""
+    if not check.passed or not check.name.startswith(BEYOND_NOISE):
+        return ""
+    if not check.value > MAX_UNNOTICED_PERCENT:
+        return ""
+    return (
+        f"{check.channel} differs from {check.name.removeprefix(BEYOND_NOISE).strip()} by "
+        f"{check.value:.2g} % more than noise explains: check gain, filter and clock of both, and "
+        "whether the body rocks"
+    )
 
 
 def _compute_response(data: LoopCheckData) -> FrequencyResponse | None:

@@ -8,6 +8,7 @@ forces are in N per m/s2.
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -25,8 +26,21 @@ TRACKED_ORDERS = 5  # fitted together; higher orders are orthogonal over whole c
 REST_WINDOW_S = 1.0  # at the end of the rest after the motion, when residual motion has decayed
 MAX_RATIO_ERROR = 0.02  # standard error above which sensors are not compared at a frequency
 MAX_MISMATCH_RATIO = 0.1  # of two sensors of one body
+NOTICE_SIGMAS = 3.0  # of the noise, beyond which a mismatch is stated
 LOW_CUT_ITERATIONS = 4  # the equations are linear but for the square of the low cut
 MIN_LOW_CUT_RAD_S = 2 * math.pi * 0.02  # below it turns the phase by 2 degrees at 0.5 Hz
+
+
+class SensorComparison(NamedTuple):
+    """Displacements against the acceleration of one body, without low cut and delay `errors`.
+
+    `mismatch` is |ratio - 1|, the largest over the held motions with low enough noise, and
+    `excess` the largest beyond NOTICE_SIGMAS of its noise; NaN if there is none.
+    """
+
+    mismatch: float = math.nan
+    excess: float = math.nan
+    errors: PairErrors = PairErrors()
 
 
 # Allowed force (low, high) in N on the (right, left) bumper, compression positive.
@@ -130,11 +144,10 @@ class LoopCheckData:
 
     def compare_sensors(
         self, displacements: tuple[str, ...], acceleration: str
-    ) -> tuple[float, PairErrors]:
+    ) -> SensorComparison:
         """Compare the second derivative of a sum of displacements with an acceleration.
 
-        Return (|ratio - 1|, errors): the largest over the held motions with low enough noise,
-        without the low cut and delay that explain all of them best; NaN if there is none.
+        Without the low cut and delay that explain all held motions best.
         """
         sensors = (*displacements, acceleration)
         if sensors not in self._comparisons:  # the table waits at rest for the verdict
@@ -142,12 +155,10 @@ class LoopCheckData:
         return self._comparisons[sensors]
 
     @cached_property
-    def _comparisons(self) -> dict[tuple[str, ...], tuple[float, PairErrors]]:
+    def _comparisons(self) -> dict[tuple[str, ...], SensorComparison]:
         return {}
 
-    def _compare(
-        self, displacements: tuple[str, ...], acceleration: str
-    ) -> tuple[float, PairErrors]:
+    def _compare(self, displacements: tuple[str, ...], acceleration: str) -> SensorComparison:
         block, rate_hz = self.block, self.block.rate_hz
         x = np.sum([block.channel(name) for name in displacements], axis=0)
         a = block.channel(acceleration)
@@ -169,7 +180,7 @@ class LoopCheckData:
                 if pair.sigma[1] <= MAX_RATIO_ERROR * pair.size:
                     pairs.append(pair)
             if not pairs:
-                return math.nan, PairErrors()
+                return SensorComparison()
             equations = [pair.normal_equations() for pair in pairs]
             low_cut = errors.low_cut
             errors = solve_errors(
@@ -180,8 +191,11 @@ class LoopCheckData:
                 break
         phase_errors = replace(errors, gain=1.0)
         corrected = [pair.remove_errors(phase_errors) for pair in pairs]
-        mismatch = max(abs(pair.displacement[1] / pair.acceleration[1] - 1.0) for pair in corrected)
-        return float(mismatch), errors
+        ratios = np.array([pair.displacement[1] / pair.acceleration[1] for pair in corrected])
+        noise_ratios = [pair.sigma[1] / abs(pair.acceleration[1]) for pair in corrected]
+        mismatches = np.abs(ratios - 1.0)
+        excess = np.maximum(mismatches - NOTICE_SIGMAS * np.array(noise_ratios), 0.0)
+        return SensorComparison(float(mismatches.max()), float(excess.max()), errors)
 
     @cached_property
     def table_low_cut(self) -> float:
@@ -197,7 +211,7 @@ class LoopCheckData:
     def _measure_low_cut(self, displacements: tuple[str, ...], acceleration: str) -> float:
         if not self.has(*displacements, acceleration):
             return 0.0
-        mismatch, errors = self.compare_sensors(displacements, acceleration)
+        mismatch, _, errors = self.compare_sensors(displacements, acceleration)
         is_proven = mismatch <= MAX_MISMATCH_RATIO and errors.low_cut >= MIN_LOW_CUT_RAD_S
         return errors.low_cut if is_proven else 0.0
 

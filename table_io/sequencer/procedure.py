@@ -162,6 +162,8 @@ def decide_after_check(state: SequencerState) -> SequencerState:
         block, state.drive, plan.profile, plan.rig, state.noise, state.preload_n
     )
     records: list[Record] = [replace(check, index=index) for check in checks]
+    notices = filter(None, map(loop_check.find_notice, checks))
+    records += [Event(index, "instrument", text) for text in notices]
     failed = [check for check in checks if not check.passed]
     if response is not None:
         records.append(replace(response, index=index))

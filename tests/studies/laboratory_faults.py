@@ -3,16 +3,23 @@
     python -m tests.studies.laboratory_faults
 
 12 kinds in 5 sizes. The samples are changed here, by nothing that the product has. A fault is named
-if a line of the loop check fails, with its remedy; it is harmless if it changes the tones of u and
-of the mass's acceleration by at most 2 %, which is what two instruments of one body may differ by.
+if a line of the loop check fails, with its remedy, or notices it, and for cells that bear nothing
+then, if the first contact of the test stops it by name. It is harmless if it changes the tones of u
+and of the mass's acceleration by at most 2 %, which is what two instruments of one body may differ
+by.
 """
 
 from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from table_io.block import Block, Float1D, Label
-from table_io.safety.loop_check import evaluate, find_remedy
+from table_io.acquisition.session import SessionSetup, run_session
+from table_io.block import Block, Float1D, Float2D, Label
+from table_io.clock import ManualClock
+from table_io.records import RunStart, Trip
+from table_io.safety.loop_check import evaluate, find_notice, find_remedy
+from table_io.sim.simulated_table import SimulatedBackend
+from tests.builders.profiles import make_profile
 from tests.builders.rigs import CHANNEL_ROWS, RIG
 from tests.table_io.safety.test_loop_check import CheckRun, record_loop_check
 
@@ -127,6 +134,32 @@ def list_faults() -> Iterator[tuple[str, str, str, Callable[[Samples], None]]]:
         yield "loose cable", f"{100 * share:g} % lost", "g4_ss3", change("mass_acc_m_s2", lose)
 
 
+class ReversedCells(SimulatedBackend):
+    """The simulated table with the cells of a side reversed."""
+
+    cells: tuple[str, ...] = ()
+
+    def tare(self, samples: int) -> Float2D:
+        return self._reverse(super().tare(samples))
+
+    def take(self, samples: int) -> Float2D:
+        return self._reverse(super().take(samples))
+
+    def _reverse(self, volts: Float2D) -> Float2D:
+        signs = [-1.0 if name in self.cells else 1.0 for name in self._rig.channels]
+        return volts * np.array(signs)[:, None]
+
+
+def stop_at_contact(cells: tuple[str, str]) -> str:
+    """Return the trip of a test through contact with reversed cells; "" if it has none."""
+    profile, clock = make_profile(), ManualClock()
+    backend = ReversedCells(RIG, profile.specimen, profile.acquisition.rate_hz, clock)
+    backend.cells = cells
+    start = RunStart(0, "", "", "table", "", "", "", RATE_HZ, 20, (), (), 0, {}, {}, "", "", 0.0)
+    items = run_session(SessionSetup(profile, RIG), backend, clock, lambda *_: start, lambda: None)
+    return next((item.text for item in items if isinstance(item, Trip)), "")
+
+
 def find_tones(check_run: CheckRun, samples: Samples) -> Float1D:
     """Return the amplitudes of u and of the mass's acceleration in each held motion, complex."""
     drive = check_run[2]
@@ -159,12 +192,18 @@ def main() -> None:
         )  # fmt: skip
         failed = [check for check in checks if not check.passed]
         change = float(np.abs(find_tones(check_run, samples) / clean - 1).max())
+        notices = [text for check in checks if (text := find_notice(check))]
         is_named = bool(failed) and all(find_remedy(check) for check in failed)
+        is_named |= not failed and bool(notices)
+        if kind.startswith("side") and not is_named:
+            first = size[0]
+            notices = [stop_at_contact((f"force_{first}1_n", f"force_{first}2_n"))]
+            is_named = "turn the cells around" in notices[0]
         if kind.startswith("side"):  # u and a are right, but the forces are not
             change = 2.0
         end = "named" if is_named else "harmless" if change <= MAX_HARMLESS_CHANGE else "MISSED"
         good, count = good + (end != "MISSED"), count + 1
-        lines = "; ".join(f"{check.name} ({check.channel})" for check in failed[:3])
+        lines = "; ".join([f"{check.name} ({check.channel})" for check in failed[:3]] or notices)
         print(
             f"{kind}, {size}: {end}, {100 * change:.2g} % of a tone{': ' + lines if lines else ''}"
         )

@@ -30,6 +30,7 @@ from table_io.safety.loop_check import (
     SETTLE_CYCLES,
     count_hold_cycles,
     evaluate,
+    find_notice,
     find_remedy,
     list_known_faults,
     plan_targets,
@@ -357,6 +358,19 @@ def test_mass_laser_on_the_table_is_told_from_a_reversed_one(name: str) -> None:
     lines = {("motion against the floor", "mass_disp_m")}
     assert list_failures(name, {"mass_disp_m": lambda values: values - table}) == lines
     assert "rel_disp_m" in REMEDIES["motion against"]
+
+
+@pytest.mark.parametrize(("gain", "is_noticed"), [(1.0, False), (1.002, False), (1.02, True)])
+def test_sensors_of_a_body_that_differ_beyond_noise_are_noticed(
+    gain: float, is_noticed: bool
+) -> None:
+    """Far below the limit, so the test runs; in contact no less."""
+    for name in ("g4_ss3", "gm1"):
+        checks = evaluate_checks(name, {"mass_disp_m": multiply(gain)})
+        notices = [text for check in checks if (text := find_notice(check))]
+        assert all(check.passed for check in checks)
+        assert len(notices) == is_noticed
+        assert all("mass_disp_m differs from mass_acc_m_s2" in text for text in notices)
 
 
 @pytest.mark.parametrize("cell", CELLS)
