@@ -288,12 +288,12 @@ def _shade_steps(
     duration_s = blocks[-1].time_s[-1] - blocks[0].time_s[0]
     next_label_s = 0.0
     for block in blocks:
-        cuts = np.flatnonzero(np.diff(block.step)) + 1
+        time_s, cuts = block.time_s, np.flatnonzero(np.diff(block.step)) + 1
         for first, last in zip([0, *cuts], [*cuts, len(block)], strict=True):
             step = steps_by_index.get(int(block.step[first]))
             if step is None:
                 continue
-            start, stop = block.time_s[first], block.time_s[last - 1]
+            start, stop = time_s[first], time_s[last - 1]
             shade = 0.20 if step.index % 2 else 0.09
             ax.axvspan(
                 start, stop, color=DIRECTION_COLOURS[step.direction], alpha=shade, lw=0, zorder=0
