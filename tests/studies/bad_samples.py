@@ -158,6 +158,7 @@ def _plant_samples(
     if kind == "clipped":
         middle_value = np.median(x)
         limit = float(np.quantile(np.abs(x - middle_value), 0.99 - 0.4 * share))
+        limit = max(limit, 6.0 * float(np.median(np.abs(np.diff(x, 2)))))  # beyond its noise
         bad[name] = np.clip(x, middle_value - limit, middle_value + limit)
         return bad, name, bad[name] != x
     if kind == "stuck":

@@ -73,7 +73,7 @@ MAX_TAKEN_SHARE = 0.1  # of the work done by a force: work taken, by a force tha
 # Of confused units: g, mm, inch, cm, in/s2 and their combinations.
 UNIT_FACTORS = (9.80665, 1000.0, 25.4, 2.54, 100.0, 39.3701, 386.089, 980.665, 9806.65, 10.0)
 MAX_FACTOR_ERROR = 0.05  # of gains of sensors, which are off by less
-MIN_LOSS = 0.01  # of the force: smaller work is that of sensors
+MIN_LOSS, MIN_WORK = 0.01, 0.1  # of the force: smaller work is that of sensors, or of filters
 MIN_SIDE_CORRELATION = 0.3  # of the force of a bumper with the displacement towards it
 MIN_REVERSED_PULL = 5.0  # of a load cell, over its push
 COMPARED_PAIRS = (  # displacement, the channels (with signs) that are its second derivative
@@ -346,20 +346,19 @@ def _find_stuck(channels: Mapping[str, Float1D], name: str) -> list[Span]:
         first, end = a, b + 1  # equal samples
         if end - first < least or (is_cell and x[first] in (0.0, x.min())):
             continue
-        before = np.diff(x[max(first - 5, 0) : first + 1])
-        after = np.diff(x[end : end + 6])
         jumps = [abs(x[k] - x[k - 1]) for k in (first, end) if 0 < k < x.size]
         is_off = max(jumps) >= max(3.0 * speed, MIN_STUCK_STEP * resolution)
         if x[first] != 0.0:  # at zero it may rest, while others still move
-            slopes = [abs(float(part.mean())) for part in (before, after) if part.size]
-            slope = max(slopes, default=0.0)
+            around = (x[max(first - 5, 0) : first + 1], x[end : end + 6])
+            slope = max(abs(float(np.diff(part).mean())) for part in around if part.size > 1)
             is_off |= slope >= MIN_STUCK_SPEED * speed and (
                 slope * (end - first) >= MIN_STUCK_STEP * resolution
             )
-            # the noise of a fine channel never stops
-            is_off |= is_noisy and lasting == 1.0 and end - first >= MIN_SILENT_RUN
-        if is_off and _do_others_move(channels, name, int(rows[first]), int(rows[end - 1]) + 1):
-            spans.append((int(rows[first]), int(rows[end - 1]) + 1))
+        # the noise of a fine channel never stops
+        is_silent = is_noisy and lasting == 1.0 and end - first >= MIN_SILENT_RUN and x[first] != 0
+        span = (int(rows[first]), int(rows[end - 1]) + 1)
+        if is_silent or (is_off and _do_others_move(channels, name, *span)):
+            spans.append(span)
     return spans
 
 
@@ -646,7 +645,7 @@ def _list_active_force(channels: Mapping[str, Float1D], rate_hz: float) -> Itera
         )
         return
     delay_s = float(np.arctan2(-loss, stiffness)) / omega
-    if not (is_active and delay_s > _max_delay(rate_hz)):
+    if not (is_active and (delay_s > _max_delay(rate_hz) or -loss > MIN_WORK * size)):
         delay_s = _find_late_start(u, force, rate_hz)
     if delay_s:
         later, earlier = both if delay_s > 0 else reversed(both)
