@@ -4,6 +4,9 @@ import json
 import os
 import shutil
 import sys
+import time
+import urllib.error
+import urllib.request
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +20,8 @@ from tests.monitor.browser import open_browser
 from tests.reports.recordings import start_record, summary
 from twin.archive import run_reading
 from twin.archive.catalog import Catalog, update_catalog
-from twin.archive.notes import note_run
+from twin.archive.notes import RunNotes, note_run, read_notes
+from twin.archive.page_server import serve_runs
 from twin.archive.query import index_runs, select_by_comparisons
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_start
@@ -305,3 +309,61 @@ def test_the_page_filters_sorts_compares_and_shows_trends(archive: Path, tmp_pat
         circles = "document.querySelectorAll('#trend circle').length"
         assert browser.evaluate(circles) == 4
         assert browser.console == []
+
+
+def test_notes_are_edited_on_the_served_page(archive: Path, tmp_path: Path) -> None:
+    (archive / "run0" / "report.html").write_text("<p>the report</p>")
+    note_run(archive / "run2", "old", ("kept", "gone"))
+    with serve_runs(archive, None) as address, open_browser(tmp_path / "profile") as browser:
+        browser.open(address, width=420, dark=True)
+        assert browser.evaluate("document.documentElement.scrollWidth") == 420
+        browser.evaluate("box(lines.find((line) => rowOf(line).folder === 'run2')).click()")
+        browser.evaluate(
+            "const [note, tags] = document.querySelectorAll('#chosen input');"
+            "note.value = 'it\\'s <b>B2</b>'; tags.value = 'kept, new'"
+        )
+        browser.evaluate("document.querySelector('#chosen button').click()")
+        saved = "document.querySelector('#chosen [role=status]').textContent"
+        deadline = time.monotonic() + 20.0
+        while browser.evaluate(saved) == "" and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert browser.evaluate(saved) == "Saved."
+        assert read_notes(archive / "run2") == RunNotes("it's <b>B2</b>", ("kept", "new"))
+        cell = "lines.find((line) => rowOf(line).folder === 'run2').querySelector('.remark')"
+        assert browser.evaluate(f"{cell}.textContent") == "keptnewit's <b>B2</b>"
+        assert browser.console == []
+        note_run(archive / "run2", "by another person")
+        browser.evaluate("document.querySelector('#chosen button').click()")
+        while browser.evaluate(saved) == "Saved." and time.monotonic() < deadline:
+            time.sleep(0.05)
+        assert "noted on since" in browser.evaluate(saved)
+    assert read_notes(archive / "run2").note == "by another person"
+
+
+def test_the_served_page_writes_for_nobody_else(archive: Path) -> None:
+    change = {"folder": "run2", "before": "", "note": "x", "tags": [], "untag": []}
+    with serve_runs(archive, "gap_mm = 10") as address:
+        origin = address[: address.index("/", 8)]
+
+        def post(path: str = "note", origin: str = origin, host: str = "", **keys: Any) -> int:
+            headers = {"Origin": origin} | ({"Host": host} if host else {})
+            body = json.dumps(change | keys).encode()
+            request = urllib.request.Request(address + path, body, headers)
+            try:
+                return int(urllib.request.urlopen(request, timeout=10).status)
+            except urllib.error.HTTPError as error:
+                return error.code
+
+        assert post(origin="http://example.com") == 404
+        assert post(host="example.com") == 404
+        assert post("../note") == 404
+        assert post(folder="run0") == 409  # not among those that are shown
+        assert post(folder="../..") == 409
+        assert post(note=1) == 400
+        assert read_notes(archive / "run2") == RunNotes("", ("good", "later"))
+        assert post() == 200
+        assert urllib.request.urlopen(address, timeout=10).status == 200
+        for path in (origin, f"{address}report?run0", f"{address}report?../../run0"):
+            with pytest.raises(urllib.error.HTTPError):
+                urllib.request.urlopen(path, timeout=10)
+    assert read_notes(archive / "run2").note == "x"

@@ -63,10 +63,17 @@ def runs_command(
     columns: Annotated[
         bool, typer.Option("--columns", help="Only list the columns that --where knows.")
     ] = False,
+    serve: Annotated[
+        bool,
+        typer.Option("--serve", help="Show the page at an address of this machine; notes on it."),
+    ] = False,
 ) -> None:
     """List the runs in a folder: date, test, gap, verdicts, misfit, warnings."""
-    from twin.archive.command import print_runs
+    from twin.archive.command import print_runs, show_runs
 
+    if serve:
+        show_runs(folder, where)
+        return
     print_runs(folder, json, page, where, columns)
 
 

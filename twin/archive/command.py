@@ -7,15 +7,23 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
+from table_io.clock import RealClock
 from table_io.errors import replace_escapes
 from twin.archive.catalog import update_catalog
 from twin.archive.notes import note_run
 from twin.archive.query import index_runs
 from twin.archive.run_row import COLUMN_TYPES, NUMBER_TYPE, RunRow, replace_nonfinite
-from twin.system.terminal import VERDICT_COLOURS, console, print_line, print_table
+from twin.system.terminal import (
+    VERDICT_COLOURS,
+    catch_interrupts,
+    console,
+    print_line,
+    print_table,
+)
 
 COLOURS = VERDICT_COLOURS | {"complete": "green", "stopped": "yellow"}
 MAX_LISTED = 10  # runs with a problem
+POLL_S = 0.2  # within which Ctrl-C ends the page
 PROGRESS_RUNS = 100  # between lines
 
 
@@ -71,6 +79,17 @@ def print_runs(
         print_line(f"no runs in {folder.resolve()} or in its folder runs")
     if page is not None:
         print_line(f"{page}")
+
+
+def show_runs(folder: Path, where: str | None) -> None:
+    """Serve the page of the runs in a folder until the user ends it."""
+    from twin.archive.page_server import serve_runs  # slow to import
+
+    with serve_runs(folder, where) as address, catch_interrupts("closing the page") as find_stop:
+        print_line(f"{address} shows the runs and edits notes, on this machine; Ctrl-C ends it")
+        clock = RealClock()
+        while not find_stop():
+            clock.wait_until(clock.now() + POLL_S)
 
 
 def print_note(folder: Path, text: str | None, tags: Sequence[str], untag: Sequence[str]) -> None:

@@ -1,10 +1,10 @@
 """Index page of runs: filter, sort, compare two, trends over time, and the command that notes."""
 
-import html
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from urllib.parse import quote
 
 from table_io.errors import InputError
 from twin.archive.run_row import RunRow, replace_nonfinite
@@ -52,19 +52,27 @@ def write_run_index(rows: Sequence[RunRow], page: Path, root: Path, where: str =
             value=str(page),
             remedy="give a new file",
         )
+    text = render_run_index(rows, root, where)
+    page.write_text(text.replace("<head>", f"<head>\n{INDEX_MARK}", 1), encoding="utf-8")
+
+
+def render_run_index(
+    rows: Sequence[RunRow], root: Path, where: str = "", *, is_served: bool = False
+) -> str:
+    """Return the index page; one that is served edits notes, and gets reports from its server."""
     paths = {row.folder: (root / row.folder).resolve() for row in rows}
     reports = {
-        folder: html.escape((path / "report.html").as_uri())
+        folder: f"report?{quote(folder)}" if is_served else (path / "report.html").as_uri()
         for folder, path in paths.items()
         if (path / "report.html").is_file()
     }
     data = [replace_nonfinite(row.to_columns()) | {"path": str(paths[row.folder])} for row in rows]
-    text = render_page(
+    return render_page(
         Path(__file__).with_name("runs.html"),
         rows=[*rows],
         reports=reports,
         columns=COLUMNS,
         where=where,
+        is_served=is_served,
         data=json.dumps(data).replace("<", "\\u003c"),
     )
-    page.write_text(text.replace("<head>", f"<head>\n{INDEX_MARK}", 1), encoding="utf-8")

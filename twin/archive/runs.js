@@ -58,20 +58,45 @@ function choose() {
 }
 function showNote(section, row) {
   add(section, "h2", {}, `Note on ${row.folder}`);
-  add(section, "p", { class: "note" }, "A page cannot write. This command does, into notes.toml next to the recording, which stays as it is; then list the runs again.");
+  const isServed = "served" in document.body.dataset;
+  add(section, "p", { class: "note" }, isServed ? "Save writes notes.toml next to the recording, which stays as it is."
+    : "A page that is a file cannot write; that of shaketwin runs --serve does. This command does too, into notes.toml next to the recording, which stays as it is; then list the runs again.");
   const controls = add(section, "div", { class: "controls" });
   const note = add(controls, "input", { "aria-label": "Note", placeholder: "note", size: 40 }), tags = add(controls, "input", { "aria-label": "Tags", placeholder: "tags, separated by commas" });
   note.value = row.note || "";
   tags.value = (row.tags || []).join(", ");
-  const command = add(section, "pre");
-  const update = () => {
+  const command = add(section, isServed ? "p" : "pre", { role: "status" });
+  const change = () => {
     const wanted = tags.value.split(",").map((tag) => tag.trim()).filter(Boolean), had = row.tags || [];
-    const words = [...wanted.filter((tag) => !had.includes(tag)).map((tag) => `--tag ${quote(tag)}`),
-      ...had.filter((tag) => !wanted.includes(tag)).map((tag) => `--untag ${quote(tag)}`)];
+    return { folder: row.folder, before: row.note || "", note: note.value,
+      tags: wanted.filter((tag) => !had.includes(tag)), untag: had.filter((tag) => !wanted.includes(tag)) };
+  };
+  if (isServed) {
+    const button = add(controls, "button", { type: "button" }, "Save");
+    button.addEventListener("click", () => save(row, change(), command));
+    return;
+  }
+  const update = () => {
+    const { tags: more, untag } = change();
+    const words = [...more.map((tag) => `--tag ${quote(tag)}`), ...untag.map((tag) => `--untag ${quote(tag)}`)];
     command.textContent = ["shaketwin note", quote(row.path), ...(note.value !== (row.note || "") ? [quote(note.value)] : []), ...words].join(" ");
   };
   [note, tags].forEach((field) => field.addEventListener("input", update));
   update();
+}
+async function save(row, change, status) {
+  const options = { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(change) };
+  const answer = await fetch("note", options).catch(() => null);
+  if (!answer?.ok) {
+    status.textContent = `Not saved: ${answer ? await answer.text() : "the server has ended"}`;
+    return;
+  }
+  Object.assign(row, await answer.json());
+  const cell = lines.find((line) => rowOf(line) === row).querySelector(".remark");
+  cell.replaceChildren();
+  row.tags.forEach((tag) => add(cell, "span", { class: "tag" }, tag));
+  cell.append(row.note);
+  status.textContent = "Saved.";
 }
 function showPair(section, pair) {
   add(section, "h2", {}, "Two runs");
