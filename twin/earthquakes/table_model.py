@@ -39,9 +39,10 @@ from table_io.compilation import jit_helper, jit_untyped_kernel
 
 MAX_STEP_S = 2.6e-4  # of the integrator: a tenth of the period of the fastest valve
 PRESSURE_CORNER = math.tau * 1.0  # rad/s, below it the load is not fed back
-Y, V, OIL, VALVE, VALVE_RATE, LOW_OIL, FRAME, FRAME_SPEED, STATE_SIZE = 0, 1, 2, 3, 4, 5, 6, 7, 8
+Y, V, OIL, VALVE, VALVE_RATE, LOW_OIL, FRAME, FRAME_SPEED = 0, 1, 2, 3, 4, 5, 6, 7
 # States of effects in addition: second mode of the frame, and the stroke as the loop reads it.
-FRAME_2, FRAME_2_SPEED, STROKE_READ, EXTENDED_STATE_SIZE = 8, 9, 10, 11
+FRAME_2, FRAME_2_SPEED, STROKE_READ = 8, 9, 10
+AT_REST = (0.0,) * 11
 inline_untyped: Any = jit_helper(inlined=True)  # each call copies all parameters otherwise
 LEAST_FRICTION_SHARE = 0.05  # of the friction, however it changes along the stroke
 
@@ -103,8 +104,8 @@ def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
 
 
 @inline_untyped
-def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p, rate):  # type: ignore[no-untyped-def]
-    """Write the time derivative of the state; SI.
+def _find_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p):  # type: ignore[no-untyped-def]
+    """Return the time derivative of the state as a tuple; SI.
 
     `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve,
     h the step in s.
@@ -132,36 +133,51 @@ def _write_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p
     if p.flow_asymmetry != 0.0:
         flow += p.flow_asymmetry * abs(flow)
     valve = math.tau * p.valve_hz
-    reading = stroke
+    reading, reading_rate = stroke, 0.0
     if p.transducer_gain_error != 0.0:
         reading *= 1.0 + p.transducer_gain_error
     if 0.0 < p.transducer_lag_s < h:
         reading -= (1.0 + p.transducer_gain_error) * p.transducer_lag_s * v
     elif p.transducer_lag_s > 0.0:
-        rate[STROKE_READ] = (reading - s[STROKE_READ]) / p.transducer_lag_s
+        reading_rate = (reading - s[STROKE_READ]) / p.transducer_lag_s
         reading = s[STROKE_READ]
     asked = (
         p.gain_1_s * (command - reading)
         + p.velocity_feedforward * command_rate
         - p.pressure_feedback_s * (force - s[LOW_OIL]) / m
     )
+    valve_rate = valve * (asked - s[VALVE]) - 2.0 * p.valve_damping * s[VALVE_RATE]
     frame = math.tau * p.frame_hz
-    rate[Y] = s[V]
-    rate[V] = (drive + reaction) / m
-    rate[OIL] = stiffness * (flow - v) - 2.0 * p.oil_damping * oil * force
-    rate[VALVE] = s[VALVE_RATE]
-    rate[VALVE_RATE] = valve * (valve * (asked - s[VALVE]) - 2.0 * p.valve_damping * s[VALVE_RATE])
-    rate[LOW_OIL] = PRESSURE_CORNER * (force - s[LOW_OIL])
-    rate[FRAME] = s[FRAME_SPEED]
-    rate[FRAME_SPEED] = -p.frame_ratio * drive / m - frame * (
-        frame * s[FRAME] + 2.0 * p.frame_damping * s[FRAME_SPEED]
-    )
+    frame_pull = frame * s[FRAME] + 2.0 * p.frame_damping * s[FRAME_SPEED]
+    frame_2_speed, frame_2_rate = 0.0, 0.0
     if p.second_frame_ratio != 0.0:
-        frame = math.tau * p.second_frame_hz
-        rate[FRAME_2] = s[FRAME_2_SPEED]
-        rate[FRAME_2_SPEED] = -p.second_frame_ratio * drive / m - frame * (
-            frame * s[FRAME_2] + 2.0 * p.second_frame_damping * s[FRAME_2_SPEED]
-        )
+        second = math.tau * p.second_frame_hz
+        pull = second * s[FRAME_2] + 2.0 * p.second_frame_damping * s[FRAME_2_SPEED]
+        frame_2_speed = s[FRAME_2_SPEED]
+        frame_2_rate = -p.second_frame_ratio * drive / m - second * pull
+    return (
+        s[V],
+        (drive + reaction) / m,
+        stiffness * (flow - v) - 2.0 * p.oil_damping * oil * force,
+        s[VALVE_RATE],
+        valve * valve_rate,
+        PRESSURE_CORNER * (force - s[LOW_OIL]),
+        s[FRAME_SPEED],
+        -p.frame_ratio * drive / m - frame * frame_pull,
+        frame_2_speed,
+        frame_2_rate,
+        reading_rate,
+    )
+
+
+@inline_untyped
+def _move(s, share, r):  # type: ignore[no-untyped-def]
+    """Return a state as a tuple, moved by a share of its rates."""
+    return (
+        s[0] + share * r[0], s[1] + share * r[1], s[2] + share * r[2], s[3] + share * r[3],
+        s[4] + share * r[4], s[5] + share * r[5], s[6] + share * r[6], s[7] + share * r[7],
+        s[8] + share * r[8], s[9] + share * r[9], s[10] + share * r[10],
+    )  # fmt: skip
 
 
 @inline_untyped
@@ -189,9 +205,8 @@ def _advance_memories(s, z, memory, z_valve, h, p):  # type: ignore[no-untyped-d
 @jit_untyped_kernel
 def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-untyped-def]
     """Simulate from rest; command (sample,) in m, out (2, sample): table in m and m/s2."""
-    extended = p.second_frame_ratio != 0.0 or p.transducer_lag_s > 0.0
-    size = EXTENDED_STATE_SIZE if extended else STATE_SIZE
-    s, stage, total, rate = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    # As tuples, which stay in registers: an array is written and read back at every stage.
+    s = AT_REST
     h, z, memory, z_valve = 1.0 / (rate_hz * steps), 0.0, 1.0, 0.0
     lag = p.delay_s * rate_hz
     count = command.size
@@ -202,12 +217,11 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                 z, memory, z_valve = _advance_memories(s, z, memory, z_valve, h, p)
                 if half == 1:
                     break
-                total[:] = 0.0
+                total, rate = AT_REST, AT_REST
                 for j in range(4):
                     share = 0.0 if j == 0 else (1.0 if j == 3 else 0.5)
                     weight = 1.0 if j in (0, 3) else 2.0
-                    for n in range(size):
-                        stage[n] = s[n] + (share * h * rate[n] if j else 0.0)
+                    stage = _move(s, share * h, rate)
                     at = k - 1 + (i + share) / steps - lag
                     # Quadratic B-spline through three samples: continuous speed.
                     nearest = math.floor(at + 0.5)
@@ -221,12 +235,10 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     low = int(at_r)
                     high = min(low + 1, count - 1)
                     force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
-                    _write_rates(stage, z, memory, z_valve, value, slope, force, h, m, p, rate)
-                    for n in range(size):
-                        total[n] += weight * rate[n]
-                for n in range(size):
-                    s[n] += h / 6.0 * total[n]
-        _write_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], h, m, p, rate)
+                    rate = _find_rates(stage, z, memory, z_valve, value, slope, force, h, m, p)
+                    total = _move(total, weight, rate)
+                s = _move(s, h / 6.0, total)
+        rate = _find_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], h, m, p)
         out[0, k], out[1, k] = s[Y], rate[V]
 
 
