@@ -72,3 +72,5 @@ def test_customer_report_is_a_page_and_a_pdf(folder: Path) -> None:
     assert pdf.startswith(b"%PDF")
     assert pdf.rstrip().endswith(b"%%EOF")
     assert pdf.count(b"/Type /Page\n") + pdf.count(b"/Type /Page ") >= 2
+    assert "<img" in html
+    assert b"/Subtype /Image" not in pdf  # its figures are vectors

@@ -3,6 +3,7 @@
 Import only to draw: matplotlib is slow to import.
 """
 
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, FigureBase
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -86,8 +87,14 @@ def render_figure(figure: PanelFigure | Figure) -> Figure:
         return figure
     rendered = Figure(figsize=figure.size_in)
     rendered.set_layout_engine("none")
+    draw_panels(figure, rendered)
+    return rendered
+
+
+def draw_panels(figure: PanelFigure, onto: FigureBase) -> None:
+    """Draw panels on a matplotlib figure, or on a part of one that has their proportions."""
     rows, columns = figure.panels.shape
-    axes = rendered.subplots(
+    axes = onto.subplots(
         rows, columns, sharex=figure.sharex, sharey=figure.sharey, squeeze=False,
         height_ratios=figure.heights, width_ratios=figure.widths,
         gridspec_kw=_place_panels(figure),
@@ -100,8 +107,19 @@ def render_figure(figure: PanelFigure | Figure) -> Figure:
             _repeat_calls(panel, ax)
     if figure.keys:
         handles = make_handles(figure.keys)
-        rendered.legend(handles=handles, loc="upper center", ncols=figure.key_columns)
-    return rendered
+        onto.legend(handles=handles, loc="upper center", ncols=figure.key_columns)
+
+
+def scale_style(share: float) -> dict[Any, Any]:
+    """Return RC_PARAMS with letters and lines of a share of their size."""
+    native = mpl.rcParamsDefault | RC_PARAMS
+    return RC_PARAMS | {
+        key: share * native[key]
+        for key in native
+        if key in ("font.size", "axes.titlesize", "axes.labelpad", "axes.titlepad")
+        or re.fullmatch(r"(axes|grid|lines|patch)\.(linewidth|markersize)", key)
+        or re.fullmatch(r"[xy]tick\.(major|minor)\.(size|width|pad)", key)
+    }
 
 
 def _place_panels(figure: PanelFigure) -> dict[str, float]:

@@ -3,7 +3,6 @@
 Title, set-up, instruments with their calibration, demand and achieved, deviations, signatures.
 """
 
-import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,15 +11,14 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
 from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.records import SampleGap
 from table_io.units import GRAVITY_M_S2
 from twin.drawing.page import embed_images, render_page
-from twin.drawing.panels import CaptionedFigure, Picture
-from twin.drawing.pictures import RC_PARAMS, render_figure, save_figures
+from twin.drawing.panels import CaptionedFigure, PanelFigure, Picture
+from twin.drawing.pictures import RC_PARAMS, draw_panels, save_figures, scale_style
 from twin.report.figures import draw_figures
 from twin.results.excitation_verdict import list_level_errors
 from twin.results.report_data import ReportData
@@ -32,7 +30,6 @@ from twin.system.files import hash_file
 CUSTOMER_FIGURES = ("swept_sine", "table_spectrum", "table_acceleration", "level", "prc")
 MAX_ALARMS = 10
 PAGE_IN, MARGIN, LINE = (8.27, 11.69), 0.09, 0.0155  # A4; shares of the page
-FIGURE_DPI = 200
 Rows = Sequence[tuple[str, ...]]
 
 
@@ -310,18 +307,20 @@ class _SheetWriter:
 
     def write_figure(self, figure: CaptionedFigure, picture: Picture) -> None:
         """Write a figure in the width of the sheet, with its title."""
-        buffer = io.BytesIO()
-        render_figure(figure.figure).savefig(buffer, dpi=FIGURE_DPI, format="png")
-        pixels = imread(io.BytesIO(buffer.getvalue()))
+        assert isinstance(figure.figure, PanelFigure)
+        width_in, height_in = figure.figure.size_in
         width = 1.0 - 2 * MARGIN
-        height = width * pixels.shape[0] / pixels.shape[1] * PAGE_IN[0] / PAGE_IN[1]
+        height = width * height_in / width_in * PAGE_IN[0] / PAGE_IN[1]
         self._need(height + 4 * LINE)
         self._y -= LINE
         self._write(picture.title, weight="bold")
         self._y -= 1.3 * LINE
-        axes = self._figure.add_axes((MARGIN, self._y - height, width, height))
-        axes.imshow(pixels, aspect="auto")
-        axes.set_axis_off()
+        grid = self._figure.add_gridspec(
+            3, 3, wspace=0, hspace=0, width_ratios=(MARGIN, width, MARGIN),
+            height_ratios=(1.0 - self._y, height, self._y - height),
+        )  # fmt: skip
+        with mpl.rc_context(scale_style(width * PAGE_IN[0] / width_in)):
+            draw_panels(figure.figure, self._figure.add_subfigure(grid[1, 1]))
         self._y -= height + LINE
 
     def write_signatures(self, names: Sequence[str]) -> None:
