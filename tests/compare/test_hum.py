@@ -97,24 +97,3 @@ def test_noise_alone_has_no_hum() -> None:
         spectra = {"0": grid.to_spectrum(noise)}
         assert remove_hum(spectra, grid, ~MOVING, UNKNOWN_HZ)[0]["0"] is spectra["0"]
         assert remove_hum(spectra, grid, MOVING & ~MOVING, UNKNOWN_HZ)[0]["0"] is spectra["0"]
-
-
-def test_what_is_left_of_hum_that_beats_counts_as_noise(motion: Float1D) -> None:
-    """Two machines, 0.3 Hz apart: the filter that follows the line does not follow their beat."""
-    grid = FrequencyGrid(TIME_S.size, RATE_HZ)
-    hz = grid.omega / (2 * np.pi)
-    steady = make_hum(50.0, 1.0)
-    beating = steady * (1.0 + 0.5 * np.sin(2 * np.pi * 0.3 * TIME_S))
-    densities = {}
-    for name, hum in (("steady", steady), ("beating", beating)):
-        spectra = {"0": grid.to_spectrum(motion + hum)}
-        cleaned, (remainder,) = remove_hum(spectra, grid, ~MOVING, UNKNOWN_HZ)
-        noise = remainder.add_to(np.full(hz.size, 0.1), "0", hz)
-        is_near = noise > 0.1
-        assert np.abs(hz[is_near] - 50.0).max(initial=0.0) < 1.0
-        left = grid.to_time_domain(cleaned["0"]) - clean(motion)[0]
-        densities[name] = grid.white_noise_rms(np.where(is_near, noise, 0.0)), rms_of(left, INSIDE)
-    expected, left_rms = densities["beating"]
-    assert left_rms > 0.2
-    assert 0.7 * left_rms < expected < 2.0 * left_rms
-    assert densities["steady"][0] < 0.05

@@ -28,6 +28,7 @@ LINE_WIDTH_HZ = 0.15  # standard deviation of the Gaussian filter that follows a
 SETTLING_S = 1.0 / (2.0 * math.pi * LINE_WIDTH_HZ)  # standard deviation of its response
 BEAT_HZ = 1.0  # machines with different slip
 FILTER_WIDTHS = 4.0  # half width of that filter, in standard deviations
+HUM_LASTING_S = 0.5 / (FILTER_WIDTHS * LINE_WIDTH_HZ)  # for which what is left keeps its phase
 MAX_EXCESS = 3.0  # times the amplitude at rest: above it there is a harmonic of the drive
 FREQUENCY_STEP_HZ = 0.1  # at most, between the values of a transform that measures a line
 
@@ -40,36 +41,22 @@ class _Line(NamedTuple):
     stands_out: Bool2D
 
 
-class HumRemainder(NamedTuple):
-    """What lies beside a line of hum that was removed, as hum that beats does.
-
-    `densities` are those of noise as loud, by channel; white noise of rms s has the density s.
-    """
-
-    frequency_hz: float
-    densities: dict[str, float]
-
-    def add_to(self, noise: Float1D, channel: str, hz: Float1D) -> Float1D:
-        """Return a noise density at frequencies, (frequency,) each, not less than the remainder."""
-        is_near = np.abs(hz - self.frequency_hz) < FILTER_WIDTHS * LINE_WIDTH_HZ
-        return np.where(is_near, np.maximum(noise, self.densities[channel]), noise)
-
-
 def remove_hum(
     spectra: Mapping[str, Spectrum], grid: FrequencyGrid, at_rest: Bool2D, drive_hz: Float1D
-) -> tuple[dict[str, Spectrum], list[HumRemainder]]:
-    """Return the spectra, (frequency,) each, less the hum that stands out in any, and what is left.
+) -> tuple[dict[str, Spectrum], tuple[float, ...]]:
+    """Return the spectra, (frequency,) each, less the hum that stands out in any, and its lines.
 
-    All channels are treated alike, so that a balance of their forces stays one. `at_rest` are the
-    samples before the motion, `drive_hz` the frequency of the drive, NaN where it is not known;
-    (sample,) each at the original rate.
+    Where it beats, or a harmonic of the drive lies at it, some is left, which keeps its phase for
+    `HUM_LASTING_S`. All channels are treated alike, so that a balance of their forces stays one.
+    `at_rest` are the samples before the motion, `drive_hz` the frequency of the drive, NaN where it
+    is not known; (sample,) each at the original rate.
     """
     rate_hz = grid.rate_hz / grid.decimation
     records = np.array([grid.to_time_domain(spectrum) for spectrum in spectra.values()])
     rest = records[:, at_rest[:: grid.decimation]]
     has_rest = rest.shape[1] >= MIN_REST_S * rate_hz
     lines_at_rest = _measure_lines(rest, rate_hz) if has_rest else itertools.repeat(None)
-    cleaned, remainders = dict(spectra), list[HumRemainder]()
+    cleaned, lines_hz = dict(spectra), list[float]()
     for resting, line in zip(lines_at_rest, _measure_lasting_lines(records, rate_hz), strict=False):
         line_hz, amplitudes, lasting = line
         is_hum = lasting
@@ -82,9 +69,9 @@ def remove_hum(
                 line_hz = line_hz if (is_hum & lasting).any() else resting.frequency_hz
         if is_hum.any():
             limits = np.where(is_hum, MAX_EXCESS * amplitudes, np.inf)
-            cleaned, left = _remove_line(cleaned, grid, line_hz, limits, drive_hz)
-            remainders += left
-    return cleaned, remainders
+            cleaned = _remove_line(cleaned, grid, line_hz, limits, drive_hz)
+            lines_hz.append(line_hz)
+    return cleaned, tuple(lines_hz)
 
 
 def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
@@ -160,8 +147,8 @@ def _measure_lasting_lines(records: Float2D, rate_hz: float) -> Iterator[_Line]:
 def _remove_line(
     spectra: Mapping[str, Spectrum], grid: FrequencyGrid, line_hz: float, limits: Float1D,
     drive_hz: Float1D,
-) -> tuple[dict[str, Spectrum], list[HumRemainder]]:  # fmt: skip
-    """Return the spectra less one line of hum, and what is left beside it.
+) -> dict[str, Spectrum]:  # fmt: skip
+    """Return the spectra less one line of hum.
 
     The line is followed over time. Where its amplitude exceeds the limit of a channel, (channel,),
     where a harmonic of the drive lies at it, or the record ends, hum is interpolated from before
@@ -173,8 +160,7 @@ def _remove_line(
     offset = ifftshift(np.arange(-reach, reach + 1))
     gain = np.exp(-0.5 * (offset * line_spacing / LINE_WIDTH_HZ) ** 2)
     scale = 2.0 * offset.size / grid.padded_size
-    around = np.array([spectrum[centre + offset] for spectrum in spectra.values()])
-    envelopes = scale * ifft(around * gain, axis=1)
+    envelopes = scale * ifft([x[centre + offset] * gain for x in spectra.values()], axis=1)
     step_s = 1.0 / (offset.size * line_spacing)
     time_s = np.arange(offset.size) * step_s
     is_loud = (np.abs(envelopes) > limits[:, None]).any(axis=0)
@@ -187,13 +173,7 @@ def _remove_line(
     if known.sum() < 2:  # a slow drive has a harmonic at every line
         known = inside & _is_far_from(is_loud, step_s)
     if known.sum() < 2:
-        return dict(spectra), []
-    # the median is not that of the drive, which passes the line between its steps
-    beside = np.abs(scale * ifft(around * (1.0 - gain), axis=1))[:, known] ** 2
-    power = 0.5 * np.median(beside, axis=1) / math.log(2.0)
-    width_hz = line_spacing * float(np.sum((1.0 - gain) ** 2))
-    densities = np.sqrt(power * 0.5 * grid.rate_hz / width_hz).tolist()
-    left = HumRemainder(centre * line_spacing, dict(zip(spectra, densities, strict=True)))
+        return dict(spectra)
     # the envelope turns slowly: its frequency is between two lines of the spectrum
     pairs = known[1:] & known[:-1]
     turn = np.sum((envelopes[:, 1:] * envelopes[:, :-1].conj())[:, pairs])
@@ -205,7 +185,7 @@ def _remove_line(
     for (name, spectrum), envelope in zip(spectra.items(), envelopes * turning, strict=True):
         hum = np.interp(sample_s, time_s[known], envelope[known]) * carrier
         cleaned[name] = spectrum - grid.from_time_domain(hum.real)
-    return cleaned, [left]
+    return cleaned
 
 
 def _is_far_from(marked: Bool1D, step_s: float) -> Bool1D:

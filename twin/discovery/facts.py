@@ -18,6 +18,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Int1D
+from twin.compare.hum import HUM_LASTING_S
 
 MAX_TABLES = 4096  # of cosines, by number of samples and components
 
@@ -26,12 +27,16 @@ MAX_TABLES = 4096  # of cosines, by number of samples and components
 class BlockBasis:
     """Cosine components of the blocks of one row: `block` of each sample of the row, in order.
 
-    The components are those up to `band_hz`, at `rate_hz` samples a second.
+    The components are those up to `band_hz`, at `rate_hz` samples a second. Of the lines of hum
+    `hum_hz` they tell nothing: what the blocks of `HUM_LASTING_S` have of one, in any phase and with
+    an amplitude that may grow, is taken off. `sample` is the number of each sample of the row.
     """
 
     block: Int1D
     rate_hz: float
     band_hz: float
+    sample: Int1D
+    hum_hz: tuple[float, ...] = ()
 
     @cached_property
     def _starts(self) -> Int1D:
@@ -84,10 +89,42 @@ class BlockBasis:
 
     def project(self, values: Float1D) -> Float1D:
         """Return the components of a row, (fact,), from its samples, (sample,)."""
+        return self._take_off(self._transform(values), self._hum_waves)
+
+    def _transform(self, values: Float1D) -> Float1D:
         components = np.empty(self.size)
         for samples, facts, cosines in self._groups:
             components[facts] = values[samples] @ cosines
         return components
+
+    @cached_property
+    def _hum_groups(self) -> Int1D:
+        """Number of the stretch in which hum keeps its phase, of each component, (fact,)."""
+        starts = self.sample[self._starts] / (HUM_LASTING_S * self.rate_hz)
+        return np.repeat(np.unique(starts.astype(np.int64), return_inverse=True)[1], self.counts)
+
+    @cached_property
+    def _hum_waves(self) -> list[tuple[Float1D, Float1D]]:
+        """Both phases of each line of hum, constant and growing, and their squares by stretch.
+
+        They are orthogonal, (fact,) each.
+        """
+        waves: list[tuple[Float1D, Float1D]] = []
+        for hz in self.hum_hz if self.size else ():
+            time_s = self.sample / self.rate_hz
+            phases = np.cos(2.0 * np.pi * hz * time_s), np.sin(2.0 * np.pi * hz * time_s)
+            for values in (*phases, *(time_s * phase for phase in phases)):
+                wave = self._take_off(self._transform(values), waves)
+                squares = np.bincount(self._hum_groups, wave**2)
+                waves.append((wave, np.maximum(squares, np.finfo(float).tiny)))
+        return waves
+
+    def _take_off(self, values: Float1D, waves: list[tuple[Float1D, Float1D]]) -> Float1D:
+        """Return components, (fact,), less what they have of each of the waves."""
+        for wave, squares in waves:
+            share = np.bincount(self._hum_groups, values * wave) / squares
+            values = values - share[self._hum_groups] * wave
+        return values
 
 
 @lru_cache(MAX_TABLES)

@@ -262,9 +262,9 @@ def _add_typical_noise(signals: LogSignals) -> LogSignals:
     u = signals.grid.to_time_domain(signals.relative_spectrum)
     hz = signals.omega / (2.0 * np.pi)
     slow = np.sqrt(1.0 + TYPICAL_CORNER_HZ / np.maximum(hz, 0.5 * hz[1]))
-    is_white = np.abs(np.log2(np.maximum(hz, hz[1]) / (WHITE_CYCLES * signals.grid.rate_hz))) < 1.0
+    middle = WHITE_CYCLES * signals.grid.rate_hz
     noise = {
-        channel: np.maximum(density, float(np.median(density[is_white])) * slow)
+        channel: np.maximum(density, np.interp(middle, hz, density) * slow)
         for channel, density in signals.noise.items()
     }
     return replace(signals, noise=noise, surface_noise_m=TYPICAL_SURFACE * float(np.abs(u).max()))

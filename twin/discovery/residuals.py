@@ -337,7 +337,9 @@ class LogResiduals:
             else BlockBasis(
                 _split_at_gaps(samples, block.get(name, self.sample_block)),
                 rate_hz,
-                self.row_bands.get(name, self.band_hz),
+                band_hz := self.row_bands.get(name, self.band_hz),
+                samples,
+                tuple(hz for hz in self.signals.hum_hz if hz < band_hz),
             )
             for name, samples in zip(self.rows, self._row_samples, strict=True)
         )

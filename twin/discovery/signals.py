@@ -87,6 +87,7 @@ class LogSignals:
     band_hz: float = math.inf  # highest frequency at which the measured forces exceed their noise
     motion_pass: Float1D | float = 1.0  # gain of a Wiener filter of the displacement, (frequency,)
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
+    hum_hz: tuple[float, ...] = ()  # lines of the mains that were removed
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -537,10 +538,7 @@ def build_signals(
         key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
     }
     rest_noise = {key: value for key, value in measured.items() if value is not None}
-    without_hum, remainders = remove_hum(spectra, grid, at_rest, _find_drive_hz(block))
-    hz = grid.omega / (2.0 * np.pi)
-    for remainder in remainders:
-        noise = {key: remainder.add_to(density, key, hz) for key, density in noise.items()}
+    without_hum, hum_hz = remove_hum(spectra, grid, at_rest, _find_drive_hz(block))
     signals = LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
         grid.to_spectrum(np.ones(len(block))), without_hum, noise,
@@ -550,8 +548,10 @@ def build_signals(
         block.cycle[:: grid.decimation],
         usable[:: grid.decimation],
         rest_noise,
+        hum_hz=hum_hz,
     )  # fmt: skip
     band_hz = signals.find_force_band()
+    hz = grid.omega / (2.0 * np.pi)
     roll_off = np.clip((hz / band_hz - 1.0) / (BAND_ROLL_OFF - 1.0), 0.0, 1.0)
     low_pass = grid.low_pass * (0.5 + 0.5 * np.cos(np.pi * roll_off))
     signals = replace(signals, low_pass=low_pass, band_hz=band_hz)
