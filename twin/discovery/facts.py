@@ -28,8 +28,8 @@ class BlockBasis:
     """Cosine components of the blocks of one row: `block` of each sample of the row, in order.
 
     The components are those up to `band_hz`, at `rate_hz` samples a second. Of the lines of hum
-    `hum_hz` they tell nothing: what the blocks of `HUM_LASTING_S` have of one, in any phase and with
-    an amplitude that may grow, is taken off. `sample` is the number of each sample of the row.
+    `hum_hz` they tell nothing: what the blocks of `HUM_LASTING_S` have of one, in any phase and
+    growing or not, is taken off. `sample` is the number of each sample of the row.
     """
 
     block: Int1D
