@@ -1,5 +1,6 @@
 """The guide as its reader gets it: pages, links and anchors, pictures, no network."""
 
+import json
 import re
 import subprocess
 import sys
@@ -200,3 +201,16 @@ def test_all_pages_of_the_packages_are_in_the_guide() -> None:
         if path.name != "README.md"
     }
     assert written - listed == set()
+
+
+def test_search_leads_to_every_section_by_its_text(site: Path) -> None:
+    script = (site / "search.js").read_text(encoding="utf-8")
+    sections = json.loads(script.partition("const sections = ")[2].partition(";\n")[0])
+    assert {link.partition("#")[0] for link, *_ in sections} == {
+        p.name for p in site.glob("*.html")
+    }
+    for link, _, heading, _ in sections:
+        name, _, anchor = link.partition("#")
+        assert not anchor or f'id="{anchor}"' in (site / name).read_text(encoding="utf-8")
+        assert "<" not in heading
+    assert any("gain_residual_percent" in text for *_, text in sections)

@@ -1,8 +1,10 @@
 """The guide as a folder of HTML pages that need no network, and the table of its pages."""
 
+import json
 import os
+import re
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -26,6 +28,7 @@ from twin.guide.reference import (
 PAGES_DIR = Path(__file__).parent / "pages"
 TUTORIALS_DIR = Path(__file__).parent / "tutorials"
 FILES_FOLDER = "files"  # pictures and notebooks
+SEARCH_FILE = "search.js"
 GUIDE_MARK = '<meta name="generator" content="shaketwin guide">'
 
 
@@ -173,7 +176,22 @@ def build_guide(folder: Path, program: TyperGroup, chapters: Sequence[Chapter] =
             following=following,
         )
         (folder / page.file_name).write_text(html, encoding="utf-8")
+    sections = [section for page in pages for section in _split_sections(page, rendered[page])]
+    script = (Path(__file__).parent / SEARCH_FILE).read_text(encoding="utf-8")
+    index = f"const sections = {json.dumps(sections)};\n"
+    (folder / SEARCH_FILE).write_text(index + script, encoding="utf-8")
     return folder / pages[0].file_name
+
+
+def _split_sections(page: GuidePage, rendered: RenderedMarkdown) -> Iterator[tuple[str, ...]]:
+    """Yield (link, title of the page, heading, text) of each section of a page."""
+    parts = re.split(r'<h[1-3] id="([^"]*)">(.*?)</h[1-3]>', rendered.html, flags=re.DOTALL)
+    for anchor, heading, body in zip(
+        ["", *parts[1::3]], ["", *parts[2::3]], parts[::3], strict=True
+    ):
+        words = [" ".join(Markup(text).striptags().split()) for text in (heading, body)]
+        if any(words):
+            yield f"{page.file_name}#{anchor}", page.title, *words
 
 
 def _prepare_folder(folder: Path, first_page: Path) -> None:
