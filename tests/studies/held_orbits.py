@@ -20,8 +20,9 @@ from table_io.acquisition.session import OperatorCommand, find_take_back, run_se
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
+from table_io.control.order_tracking import evaluate_transfer
 from table_io.errors import InputError
-from table_io.records import Event, OrbitPoint, RunStop
+from table_io.records import Event, FrequencyResponse, OrbitPoint, RunStop
 from table_io.units import GRAVITY_M_S2
 from twin.setup.run_config import RunConfig, read_run_config
 
@@ -88,7 +89,8 @@ def play(
 
     backend.queue = record  # type: ignore[method-assign]
     progress = [0]  # samples so far
-    accepted, stop, is_whole, correction = 0, None, True, 1.0
+    accepted, stop, is_whole, level_factor = 0, None, True, 1.0
+    response: FrequencyResponse | None = None
     rejections: list[str] = []
     for item in run_session(
         config.session_setup, backend, clock, config.make_start_factory("held", "table"),
@@ -97,13 +99,17 @@ def play(
         if isinstance(item, Block):
             is_whole &= item.index == progress[0]
             progress[0] = item.end
+        elif isinstance(item, FrequencyResponse):
+            response = item
         elif isinstance(item, OrbitPoint):
             accepted += item.accepted
             if not item.accepted:
                 rejections.append(f"orbit {item.step} at {item.frequency_hz:.3f} Hz, {item.reason}")
-            # A table that follows with a gain below 1 takes a larger command for its level.
             command_m_s2 = item.command_m * (math.tau * item.frequency_hz) ** 2
-            correction = max(correction, command_m_s2 / item.acceleration_m_s2)
+            factor = command_m_s2 / item.acceleration_m_s2
+            if response is not None:
+                factor *= abs(evaluate_transfer(response, item.frequency_hz))
+            level_factor = max(level_factor, factor)
         elif isinstance(item, Event) and item.kind == "lost":
             rejections.append(item.text)
         elif isinstance(item, RunStop):
@@ -113,9 +119,15 @@ def play(
     bound = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
     continuation = config.profile.continuation
     assert continuation is not None
+    # A table that follows with a gain below 1 takes a larger command for its level.
+    plan = continuation.orbit_plan
+    correction = level_factor
+    if response is not None:
+        orbits = (*plan.leads, *plan.points)
+        correction /= min(abs(evaluate_transfer(response, each.frequency_hz)) for each in orbits)
     command_m = written[:end] * rig.output.span_mm * 1e-3 / rig.output.span_v
     return HeldTest(
-        accepted, len(continuation.orbit_plan.points), stop.verdict, stop.reason, command_m,
+        accepted, len(plan.points), stop.verdict, stop.reason, command_m,
         config.drive.rate_hz, bound * correction, continuation.acceleration_g * GRAVITY_M_S2,
         is_whole and stop.index == end, tuple(rejections),
     )  # fmt: skip
