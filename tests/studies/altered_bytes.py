@@ -2,8 +2,8 @@
 
     python -m tests.studies.altered_bytes --count 200 --seed 1
 
-In turn in a study of `map`, a recording, a drive and a twin of a table. An alteration is harmless
-if every value that is read is the same as before.
+In turn in a study of `map`, a recording, a drive, a twin of a table and a tare. An alteration is
+harmless if every value that is read is the same as before.
 """
 
 import argparse
@@ -17,8 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from table_io.config.base import load_config
 from table_io.config.excitation.drive_file import DriveHeader, format_drive, parse_drive
 from table_io.config.provenance import Provenance, seal_text
+from table_io.config.tare import TareFile, TareRecord, format_tare_toml
 from table_io.errors import InputError
 from tests.cli.test_hostile_toml import OWN
 from tests.studies.random_laws import PROFILE
@@ -56,6 +58,10 @@ def read_twin_values(path: Path) -> Hashable:
     return load_table_twin(path).model_dump_json()
 
 
+def read_tare_values(path: Path) -> Hashable:
+    return load_config(path, TareFile, "tare")[0].tare.model_dump_json()
+
+
 def write_artefacts(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Hashable]]]:
     """Write one artefact of each kind; return its path and reader by kind."""
     make_stored_study(write_study(folder), folder / "study", range(5))
@@ -68,11 +74,17 @@ def write_artefacts(folder: Path) -> dict[str, tuple[Path, Callable[[Path], Hash
     )
     (folder / "drive.csv").write_text(drive)
     (folder / "twin.toml").write_text(seal_text(OWN["twins"]))
+    record = TareRecord(
+        rig="simulated", at="2026-07-01T10:00:00+02:00", by="operator", seconds=4.0,
+        channels=("mass_disp_m", "force_r1_n"), volts=(0.0123, -0.00456), noise_v=(1e-4, 2e-4),
+    )  # fmt: skip
+    (folder / "tare.toml").write_text(format_tare_toml(record))
     return {
         "study": (folder / "study", read_study_values),
         "recording": (folder / "run.mcap", read_log_values),
         "drive": (folder / "drive.csv", read_drive_values),
         "table twin": (folder / "twin.toml", read_twin_values),
+        "tare": (folder / "tare.toml", read_tare_values),
     }
 
 
