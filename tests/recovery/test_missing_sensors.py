@@ -73,8 +73,8 @@ def test_bumpers_that_the_mass_does_not_reach_are_no_parameters(tmp_path: Path) 
     assert fit.values[STIFFNESS] == pytest.approx(specimen.k, rel=0.02)
 
 
-def test_hum_that_beats_is_noise_at_its_frequency_alone(tmp_path: Path) -> None:
-    """What its removal leaves does not repeat between cycles; an appendage of 49 Hz was named."""
+def test_hum_that_beats_leaves_no_noise_at_its_frequency(tmp_path: Path) -> None:
+    """What the filter of a line leaves was several times the noise; an appendage was named."""
     specimen, test = Specimen(gap_mm=-1.0), StepTest(2.0, 9.0, 1.0, 10)
     columns = record(specimen, Instruments(filter_share=0.25, hum=3.0, beat_hz=0.3), 7, test)
     logs, _ = load_logs([import_columns(columns, tmp_path, format_profile(specimen, test))])
@@ -82,5 +82,5 @@ def test_hum_that_beats_is_noise_at_its_frequency_alone(tmp_path: Path) -> None:
     at_hum, elsewhere = number_bands(np.array([50.0, 20.0]))
     for side in ("right cells", "left cells"):
         scale = residuals.noise_scale[side]
-        assert scale[at_hum] > 1.5 * scale[elsewhere]
+        assert scale[at_hum] < 1.2 * scale[elsewhere]
         assert scale[elsewhere] < 1.3
