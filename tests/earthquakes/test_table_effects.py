@@ -57,6 +57,7 @@ SIZES: dict[str, dict[str, float]] = {
     "dead_band": {"dead_band_m_s": 3e-3},
     "valve_hysteresis": {"valve_hysteresis_m_s": 1.2e-3},
     "flow_asymmetry": {"flow_asymmetry": 0.05},
+    "friction_drift": {"friction_drift_1_s": 0.5},
     "friction_asymmetry": {"friction_asymmetry": 0.25},
     "friction_slope": {"friction_slope_1_m": 40.0},
     "backlash": {"backlash_m": 6e-5},
@@ -107,7 +108,8 @@ def solve_independently(p: TableParameters, times: Float1D) -> Float2D:
         limit = (1 + direction * p.friction_asymmetry) * (1 + p.friction_slope_1_m * q)
         slip = 1 - direction * z / limit
         dry = p.friction_n + p.static_excess_n * math.exp(-((v / p.stribeck_speed_m_s) ** 2))
-        net = force - dry * z - (p.viscous_n_s_m + p.stick_damping_n_s_m * slip) * v
+        friction = dry * z + (p.viscous_n_s_m + p.stick_damping_n_s_m * slip) * v
+        net = force - (1 + p.friction_drift_1_s * t) * friction
         opening = spool - p.valve_hysteresis_m_s / 2 * x
         opening = math.copysign(max(abs(opening) - p.dead_band_m_s, 0.0), opening)
         sign = math.copysign(1.0, opening)
@@ -232,10 +234,11 @@ def test_table_and_twin_are_changed_alike(name: str) -> None:
     assert 0.8 < change @ expected / (change @ change) < 1.2
 
 
-def rehearse_on_twin(name: str, seconds: float = 24.0) -> EffectDiscovery:
+def rehearse_on_twin(name: str, seconds: float = 24.0, **sizes: float) -> EffectDiscovery:
     """Return what is found in a rehearsal of the twin itself, from a fit that begins near it."""
     command = make_random_motion(seconds, (0.3, 35.0), 0.2, seed=11)
-    true = BASIC._replace(viscous_n_s_m=1500.0, friction_memory=0.8, **SIZES.get(name, {}))
+    sizes = sizes or SIZES.get(name, {})
+    true = BASIC._replace(viscous_n_s_m=1500.0, friction_memory=0.8, **sizes)
     y, acceleration = TableModel(MASS_KG, true).simulate(command, RATE_HZ)
     rng = np.random.default_rng(5)
     acceleration = acceleration + 5e-3 * rng.standard_normal(command.size)
@@ -259,6 +262,15 @@ def test_a_planted_effect_is_named_with_its_size() -> None:
     assert discovery.fit.parameters.flow_asymmetry == pytest.approx(0.05, abs=width)
     assert discovery.gap < 0.6 * discovery.findings[0].gap_before
     assert "flow that differs with direction" in describe_discovery(discovery)[0]
+
+
+@pytest.mark.slow  # 9 s
+def test_friction_that_falls_as_the_oil_warms_up_is_named_with_its_drift() -> None:
+    discovery = rehearse_on_twin("friction_drift", 50.0, friction_drift_1_s=-0.008)
+    assert [finding.id for finding in discovery.findings] == ["friction_drift"]
+    width = discovery.fit.estimate_half_widths()["friction_drift_1_s"]
+    assert discovery.fit.parameters.friction_drift_1_s == pytest.approx(-0.008, abs=width)
+    assert width < 0.001
 
 
 def test_nothing_is_named_where_nothing_is_missing() -> None:

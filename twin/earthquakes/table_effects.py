@@ -119,6 +119,18 @@ LIBRARY: tuple[TableEffect, ...] = (
         _list_trials(0.05),
     ),
     TableEffect(
+        "friction_drift",
+        "friction that drifts with time, as oil and seals warm up",
+        "F -> (1 + d_F t) F",
+        "Merritt (1967), chapter 1: viscosity of oil over temperature",
+        (
+            TableEffectParameter(
+                "friction_drift_1_s", "1/s", 2e-3, -0.02, 0.05, "Relative change per time."
+            ),
+        ),
+        _list_trials(2e-3),
+    ),
+    TableEffect(
         "friction_asymmetry",
         "friction that differs with direction",
         "z -> +-(1 + a_F sign(v)) instead of +-1, of the same stiffness",
@@ -460,7 +472,8 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
     if discovery.closest is not None:
         lines.append(
             f"  {_list_names([discovery.closest.id])} would leave "
-            f"{100 * discovery.closest.gap:.3g} %: too little gained to name it"
+            f"{100 * discovery.closest.gap:.3g} %: too little gained, or too unevenly over the "
+            "time, to name it"
         )
     lines.append("cannot be judged from this rehearsal:")
     lines += [f"  {name}: {reason}" for name, reason in UNTESTED.items()]

@@ -20,6 +20,7 @@ describes them and finds out which one a table has:
     u -> u (1 + a_u sign(u))                          (valve: dead band, hysteresis, direction)
     f -> f - K b/2 sat(2 f / (K b))                              (coupling: backlash b)
     z -> +-z_m instead of +-1, z_m = (1 + a_F sign(v)) (1 + g_F (y - y_f))  (friction)
+    F -> (1 + d_F t) F                                           (friction that drifts with time t)
     y - y_f -> q_t in e, t_t q_t' = (1 + g_t) (y - y_f) - q_t              (transducer)
     y_f -> y_f + y_2, y_2'' = -r_2 (f - F(v)) / m - w_2 (w_2 y_2 + 2 z_2 y_2')  (second frame mode)
 
@@ -84,6 +85,7 @@ class TableParameters(NamedTuple):
     second_frame_damping: float = 0.05
     second_frame_ratio: float = 0.0
     friction_memory: float = 0.0
+    friction_drift_1_s: float = 0.0
 
 
 @inline_untyped
@@ -104,11 +106,11 @@ def _find_friction_share(sign, stroke, p):  # type: ignore[no-untyped-def]
 
 
 @inline_untyped
-def _find_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p):  # type: ignore[no-untyped-def]
+def _find_rates(s, z, memory, z_valve, command, command_rate, reaction, t, h, m, p):  # type: ignore[no-untyped-def]
     """Return the time derivative of the state as a tuple; SI.
 
     `memory` is the exponential of the Stribeck force with its lag, `z_valve` is that of the valve,
-    h the step in s.
+    t the time in s and h the step.
     """
     oil = math.tau * p.oil_hz
     stiffness = m * oil * oil
@@ -125,6 +127,8 @@ def _find_rates(s, z, memory, z_valve, command, command_rate, reaction, h, m, p)
         sign = 1.0 if v > 0.0 else -1.0
         sticking = 1.0 - sign * z / _find_friction_share(sign, stroke, p)
     drive = force - z * dry - (p.viscous_n_s_m + p.stick_damping_n_s_m * sticking) * v
+    if p.friction_drift_1_s != 0.0:
+        drive = force + (1.0 + p.friction_drift_1_s * t) * (drive - force)
     opening = s[VALVE] - 0.5 * p.valve_hysteresis_m_s * z_valve
     if p.dead_band_m_s > 0.0:
         opening -= min(max(opening, -p.dead_band_m_s), p.dead_band_m_s)
@@ -235,10 +239,11 @@ def _simulate(command, reaction, m, rate_hz, steps, p, out):  # type: ignore[no-
                     low = int(at_r)
                     high = min(low + 1, count - 1)
                     force = reaction[low] + (at_r - low) * (reaction[high] - reaction[low])
-                    rate = _find_rates(stage, z, memory, z_valve, value, slope, force, h, m, p)
+                    t = (k - 1 + (i + share) / steps) / rate_hz
+                    rate = _find_rates(stage, z, memory, z_valve, value, slope, force, t, h, m, p)
                     total = _move(total, weight, rate)
                 s = _move(s, h / 6.0, total)
-        rate = _find_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], h, m, p)
+        rate = _find_rates(s, z, memory, z_valve, 0.0, 0.0, reaction[k], k / rate_hz, h, m, p)
         out[0, k], out[1, k] = s[Y], rate[V]
 
 
