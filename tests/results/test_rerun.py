@@ -181,12 +181,18 @@ def test_a_part_is_computed_from_the_saved_states_before_it(
         assert block.is_identical(whole.cut(first, end)), (first, end)
 
 
+@pytest.mark.parametrize("change", ["another value", "too short", "not a number"])
 def test_a_saved_state_that_does_not_lead_to_the_hashes_is_not_used(
-    sparse: Recording, recording: Recording
+    sparse: Recording, recording: Recording, change: str
 ) -> None:
     (whole,) = recording.contiguous_blocks("pred")
+
+    def alter(state: tuple[float, ...]) -> tuple[float, ...]:
+        first = {"another value": (state[0] + 1e-3,), "too short": (), "not a number": (np.nan,)}
+        return (*first[change], *state[1:])
+
     entries = [
-        replace(item, free=(item.free[0] + 1e-3, *item.free[1:]))
+        replace(item, free=alter(item.free))
         if isinstance(item, PredictionHash) and item.free
         else item
         for item in sparse.items.entries

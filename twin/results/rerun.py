@@ -145,7 +145,12 @@ def _resume_predictions(
     if not covering or covering[-1].end < end or changes:
         return None
     needed = covering[0].index - setup.delay_samples
-    saved = [entry for entry in hashes if entry.free and entry.window and entry.end <= needed]
+    size = setup.solver.rest_state(0).size  # a compiled solver does not check it
+    saved = [
+        entry
+        for entry in hashes
+        if len(entry.free) == len(entry.window) == size and entry.end <= needed
+    ]
     if not saved:
         return None
     start, states = saved[-1].end, (saved[-1].free, saved[-1].window)
