@@ -2,10 +2,15 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
+import pytest
 
+from twin.discovery import cross_checks
 from twin.discovery.build_verdict import build_interval, build_parameter
+from twin.discovery.contact_onsets import ContactGaps
 from twin.discovery.cross_checks import SubsetEstimate, list_disagreements
 from twin.discovery.least_squares import FitResult
 from twin.discovery.motion import RecordScale
@@ -46,3 +51,18 @@ def test_too_few_cycles_give_no_interval() -> None:
     limits = Interval.model_validate_json(parameter.to_json())
     assert limits == parameter
     assert (limits.value, limits.low, limits.high) == (36e3, None, None)
+
+
+@pytest.mark.parametrize(("shift_mm", "is_warned"), [(-0.06, False), (-0.14, True), (0.14, True)])
+def test_onsets_are_off_where_they_lie_beyond_their_scatter(
+    monkeypatch: pytest.MonkeyPatch, shift_mm: float, is_warned: bool
+) -> None:
+    """A filter moves all onsets by about as much as they scatter, a law of the bumper by more."""
+    monkeypatch.setattr(cross_checks, "fitted_gap", lambda *_: 2e-3)
+    spread_m = 0.034e-3 / 1.4826 * np.resize([-1.0, 1.0], 160)
+    gaps = ContactGaps(0, "right", "onset", 2e-3 + 1e-3 * shift_mm + spread_m, np.zeros(160))
+    log: Any = SimpleNamespace(
+        signals=SimpleNamespace(name="log"), scale=SimpleNamespace(u=5e-3), log_number=0
+    )
+    joint: Any = SimpleNamespace(std_errors={})
+    assert len([*cross_checks.list_onset_warnings([log], joint, [gaps])]) == is_warned

@@ -1,5 +1,6 @@
 """Cross-checks of a fit: estimates from subsets of the samples, and warnings on disagreement."""
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ MIN_SUBSET_BLOCKS = 6  # with fewer blocks the standard error of a subset is unr
 MIN_DETERMINING_BLOCKS = 4.0  # with fewer, a warning
 # standard deviations at which two estimates disagree; high because about thirty are compared
 MIN_DISAGREEMENT_SIGMA = 4.0
+MAX_COMMON_SHIFT = 2.0  # of the scatter of single crossings: shift of all that is no evidence
 # smallest disagreement reported: relative, and for a gap of the largest displacement
 MIN_DISAGREEMENT_SHARE, MIN_DISAGREEMENT_OF_U = 0.01, 1e-3
 OPPOSED_SUBSETS = (
@@ -190,7 +192,8 @@ def list_fit_warnings(
                 f"{key}: determined by {max(round(count), 1)} contacts or cycles alone; its "
                 "interval is wide for that and assumes that others would be alike"
             )
-    for key in joint.at_bound:
+    # The bound of a correction is what a rest of the log can hide of it, which is no result.
+    for key in itertools.filterfalse(is_correction, joint.at_bound):
         yield f"{key}: at its bound, {joint.values[key]:.4g}; its interval is not valid"
     for residuals in log_residuals:
         for nuisance, z in list_sizes(residuals, joint.parameters):
@@ -254,12 +257,16 @@ def _notable_difference(value: float, unit: str, scale: RecordScale) -> float:
 def list_onset_warnings(
     log_residuals: Sequence[LogResiduals], joint: FitResult, contact_gaps: Sequence[ContactGaps]
 ) -> Iterator[str]:
-    """Yield a warning where the gap from contact onsets or releases differs from the fitted gap."""
+    """Yield a warning where the gap from contact onsets or releases differs from the fitted gap.
+
+    What filters and sampling shift in all crossings alike is of the size of their scatter.
+    """
     for gaps in contact_gaps:
         gap = fitted_gap(log_residuals[gaps.log], joint, gaps.side)
         notable = _notable_difference(gap, "m", log_residuals[gaps.log].scale)
         sd = math.hypot(gaps.std_error, joint.std_errors.get(GapKey(gaps.log), 0.0))
-        if abs(gaps.value - gap) > max(MIN_DISAGREEMENT_SIGMA * sd, notable):
+        common = MAX_COMMON_SHIFT * gaps.scatter
+        if abs(gaps.value - gap) > max(MIN_DISAGREEMENT_SIGMA * sd, notable, common):
             yield (
                 f"{log_residuals[gaps.log].signals.name}: {gaps.side} {gaps.kind}s lie at "
                 f"{1e3 * gaps.value:.3f} mm, the fitted gap at {1e3 * gap:.3f} mm: the bumper law "
