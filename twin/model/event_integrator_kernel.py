@@ -335,8 +335,8 @@ def flush_face(u_j: float, sign: float, is_driven: bool) -> float:
 
 @jit_helper(inlined=True)
 def flush_value(value: float) -> float:
-    """Return 0 for a value that has decayed."""
-    return value if abs(value) > DENORMAL_LIMIT else 0.0
+    """Return 0 for a value that has decayed; NaN stays NaN."""
+    return 0.0 if abs(value) <= DENORMAL_LIMIT else value
 
 
 @jit_helper_unless_none("s", lambda s: None)
