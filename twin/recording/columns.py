@@ -6,7 +6,7 @@ several times the memory of the samples.
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import overload
+from typing import TypeVar, cast, overload
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from table_io.block import Block, join_contiguous
 from table_io.records import Record
 
 Item = Block | Record
+R = TypeVar("R", bound=Record)
 
 
 class Columns:
@@ -120,13 +121,17 @@ StoredItem = Record | StoredBlock
 class StoredItems(Sequence[Item]):
     """Items in their order; reading a block makes it anew."""
 
-    __slots__ = ("_contiguous", "entries", "records")
+    __slots__ = ("_by_kind", "_contiguous", "entries", "records")
 
     def __init__(self, entries: Iterable[StoredItem]) -> None:
         self.entries: tuple[StoredItem, ...] = tuple(entries)
         self.records: tuple[Record, ...] = tuple(
             entry for entry in self.entries if not isinstance(entry, StoredBlock)
         )
+        by_kind: dict[type, list[Record]] = {}
+        for record in self.records:
+            by_kind.setdefault(type(record), []).append(record)
+        self._by_kind = {kind: tuple(records) for kind, records in by_kind.items()}
         self._contiguous: dict[str, tuple[Block, ...]] = {}
 
     def __len__(self) -> int:
@@ -143,6 +148,10 @@ class StoredItems(Sequence[Item]):
         if isinstance(place, slice):
             return [_read_entry(entry) for entry in self.entries[place]]
         return _read_entry(self.entries[place])
+
+    def records_of(self, kind: type[R]) -> tuple[R, ...]:
+        """Return the records of one type, in their order."""
+        return cast(tuple[R, ...], self._by_kind.get(kind, ()))
 
     def stored_blocks(self, stream: str) -> Iterator[StoredBlock]:
         """Yield the places of the blocks of a stream, in order of sample index."""

@@ -70,7 +70,7 @@ class Recording:
 
     def records(self, kind: type[R]) -> tuple[R, ...]:
         """Return all records of one type, in order of sample index."""
-        return tuple(record for record in self.items.records if isinstance(record, kind))
+        return self.items.records_of(kind)
 
     def blocks(self, stream: str) -> tuple[Block, ...]:
         """Return all blocks of stream "meas" or "pred", in order of sample index."""
