@@ -35,6 +35,7 @@ from scipy.io import loadmat
 from scipy.signal import resample_poly
 
 from table_io.block import Float1D
+from twin.system.exit_codes import EXIT_GAPS
 
 SHAKETWIN = (sys.executable, "-c", "from twin.cli.table import main; main()")
 INCH_M, KIP_N = 0.0254, 4448.2216152605
@@ -504,7 +505,7 @@ def run_shaketwin(*arguments: str | Path) -> str:
     done = subprocess.run(
         [*SHAKETWIN, *map(str, arguments)], capture_output=True, text=True, check=False
     )
-    if done.returncode:
+    if done.returncode not in (0, EXIT_GAPS):
         raise RuntimeError(f"shaketwin {arguments[0]}: {(done.stderr or done.stdout).strip()}")
     return done.stdout
 
