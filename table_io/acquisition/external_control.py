@@ -129,9 +129,7 @@ class PassiveProtection:
         if not self.has_command:
             return (Event(index, "check", "no command is wired: the loop check is not evaluated"),)
         checks, response = loop_check.evaluate(block, drive, profile, rig, self.noise)
-        records: list[Record] = [replace(check, index=index) for check in checks]
-        notices = filter(None, map(loop_check.find_notice, checks))
-        records += [Event(index, "instrument", text) for text in notices]
+        records = loop_check.list_check_records(checks, index)
         if response is not None:
             response = replace(response, index=index)
             records.append(response)

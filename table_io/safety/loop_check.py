@@ -16,6 +16,7 @@ force.
 
 import math
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +33,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import SineTarget
-from table_io.records import Check, FrequencyResponse
+from table_io.records import Check, Event, FrequencyResponse, Record
 from table_io.safety.consistency import MAX_CELL_OFFSET_RATIO, SENSOR_PAIRS
 from table_io.safety.loop_check_data import (
     MAX_MISMATCH_RATIO,
@@ -626,6 +627,13 @@ def evaluate(
 def find_remedy(check: Check) -> str:
     """Return the remedy for a failed check; empty if there is none."""
     return next((text for name, text in REMEDIES.items() if check.name.startswith(name)), "")
+
+
+def list_check_records(checks: Iterable[Check], index: int) -> list[Record]:
+    """Return the checks as evaluated at sample `index`, then what the operator is told of them."""
+    dated = [replace(check, index=index) for check in checks]
+    notices = (Event(index, "instrument", text) for check in dated if (text := find_notice(check)))
+    return [*dated, *notices]
 
 
 def find_notice(check: Check) -> str:

@@ -161,9 +161,7 @@ def decide_after_check(state: SequencerState) -> SequencerState:
     checks, response = loop_check.evaluate(
         block, state.drive, plan.profile, plan.rig, state.noise, state.preload_n
     )
-    records: list[Record] = [replace(check, index=index) for check in checks]
-    notices = filter(None, map(loop_check.find_notice, checks))
-    records += [Event(index, "instrument", text) for text in notices]
+    records = loop_check.list_check_records(checks, index)
     failed = [check for check in checks if not check.passed]
     if response is not None:
         records.append(replace(response, index=index))
