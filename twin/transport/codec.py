@@ -127,16 +127,20 @@ def encode_comparisons(comparisons: Sequence[Comparison], run: str) -> list[byte
         sums = [(each.measured_ss, each.free_error_ss, each.window_error_ss) for each in group]
         columns = np.array(sums, "<f8")  # (comparison, 3, channel)
         rows = np.tile(np.frombuffer(body, np.uint8), (len(group), 1))
-        end, size = len(body) - len(encode_run(Comparison, run)), 8 * columns.shape[2]
-        header = len(pb.Comparison(measured_ss=group[0].measured_ss).SerializeToString()) - size
-        for column in (2, 1, 0):
-            rows[:, end - size : end] = np.ascontiguousarray(columns[:, column]).view(np.uint8)
-            end -= size + header
+        for column, place in enumerate(_locate_sums(group[0], run, len(body))):
+            rows[:, place] = np.ascontiguousarray(columns[:, column]).view(np.uint8)
         payloads += [
             pb.Comparison(index=each.index).SerializeToString() + row.tobytes()
             for each, row in zip(group, rows, strict=True)
         ]
     return payloads
+
+
+def _locate_sums(comparison: Comparison, run: str, length: int) -> list[slice]:
+    """Return the places of measured, free and window sums in a payload of so many bytes."""
+    end, size = length - len(encode_run(Comparison, run)), 8 * len(comparison.channels)
+    step = len(pb.Comparison(measured_ss=comparison.measured_ss).SerializeToString())
+    return [slice(end - size - k * step, end - k * step) for k in (2, 1, 0)]
 
 
 def decode_comparisons(payloads: Sequence[bytes]) -> list[tuple[str, Comparison] | None]:
@@ -163,20 +167,17 @@ def decode_comparisons(payloads: Sequence[bytes]) -> list[tuple[str, Comparison]
         digits = len(pb.Comparison(index=first.index).SerializeToString())  # with the tag
         is_free = np.zeros(length, dtype=bool)
         is_free[1:digits] = True
-        end, size = length - len(encode_run(Comparison, run)), 8 * len(first.channels)
-        header = len(pb.Comparison(measured_ss=first.measured_ss).SerializeToString()) - size
         columns = []
-        for _ in range(3):
-            is_free[end - size : end] = True
-            columns.append(np.ascontiguousarray(rows[:, end - size : end]).view("<f8").tolist())
-            end -= size + header
+        for span in _locate_sums(first, run, length):
+            is_free[span] = True
+            columns.append(np.ascontiguousarray(rows[:, span]).view("<f8").tolist())
         is_alike = (rows[:, ~is_free] == rows[0, ~is_free]).all(axis=1)
         varint = rows[:, 1:digits]
         is_alike &= ((varint & 0x80) == (varint[0] & 0x80)).all(axis=1)
         weights = 1 << 7 * np.arange(varint.shape[1])
         indices = ((varint & 0x7F) * weights).sum(axis=1, dtype=np.int64)
         is_alike &= indices <= MAX_SAMPLE_INDEX
-        for place, alike, index, window, free, measured in zip(
+        for place, alike, index, measured, free, window in zip(
             places, is_alike.tolist(), indices.tolist(), *columns, strict=True
         ):
             if alike:
