@@ -4,7 +4,7 @@ import heapq
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 from pathlib import Path
 
 from table_io.block import Block
@@ -27,7 +27,7 @@ from table_io.records import (
 from twin.compare import pipeline
 from twin.compare.pipeline import EVENT_KINDS
 from twin.compare.prediction_hash import hash_cells
-from twin.compare.twins import advance_twins, resume_twins
+from twin.compare.twins import TwinSetup, advance_twins, resume_twins
 from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
@@ -108,6 +108,11 @@ class Predictions:
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
 
+    def read(self, first: int, end: int) -> tuple[Block, ...]:
+        """Return blocks of predictions with all known ones of samples first .. end - 1."""
+        block = None if self._config is None else self._resume(self._config, first, end)
+        return self._whole if block is None else (block,)
+
     @cached_property
     def _config(self) -> RunConfig | None:
         start = self._recording.start
@@ -122,51 +127,47 @@ class Predictions:
     def _whole(self) -> tuple[Block, ...]:
         return restore_predictions(self._recording, self._config).contiguous_blocks("pred")
 
-    def read(self, first: int, end: int) -> tuple[Block, ...]:
-        """Return blocks of predictions with all known ones of samples first .. end - 1."""
-        if self._config is not None and "_whole" not in vars(self):
-            block = _resume_predictions(self._recording, self._config, first, end)
-            if block is not None:
-                return (block,)
-        return self._whole
+    def _resume(self, config: RunConfig, first: int, end: int) -> Block | None:
+        """Return the predictions of samples first .. end - 1, from the last saved states.
 
-
-def _resume_predictions(
-    recording: Recording, config: RunConfig, first: int, end: int
-) -> Block | None:
-    """Return the predictions of samples first .. end - 1, computed from the last saved states.
-
-    None where these, the samples or the hashes do not suffice: then the twin must be rerun.
-    """
-    setup = pipeline.prepare_twins(config.profile, config.model)
-    hashes = recording.records(PredictionHash)
-    covering = [entry for entry in hashes if entry.index < end and first < entry.end]
-    changes = [*_list_twin_faults(recording), *_parameter_changes(recording, config)]
-    if not covering or covering[-1].end < end or changes:
+        None where these, the samples or the hashes do not suffice: then the twin must be rerun.
+        """
+        setup = pipeline.prepare_twins(config.profile, config.model)
+        hashes = self._recording.records(PredictionHash)
+        covering = [entry for entry in hashes if entry.index < end and first < entry.end]
+        changes = _parameter_changes(self._recording, config)
+        if not covering or changes or _list_twin_faults(self._recording):
+            return None
+        begin, last = covering[0].index, covering[-1].end
+        saved = _find_saved(hashes, setup, begin - setup.delay_samples)
+        if saved is None or not begin <= first < end <= last:
+            return None
+        start = saved.end
+        for block in self._recording.contiguous_blocks("meas"):
+            before = max(start - setup.history_samples, block.index)
+            if not (block.index <= before < start and last <= block.end):
+                continue
+            twins = resume_twins(setup, (saved.free, saved.window), block.cut(before, start))
+            predicted = advance_twins(setup, twins, block.cut(start, last))[1].cut(begin, last)
+            values, size = predicted.values, setup.hash_samples
+            _, again = hash_cells(values[:, :0], last, values, size, {})
+            pairs = zip_longest(again, covering)
+            is_same = all(new and new.is_same_output(old) for new, old in pairs)
+            return predicted.cut(first, end) if is_same else None
         return None
-    needed = covering[0].index - setup.delay_samples
+
+
+def _find_saved(
+    hashes: Iterable[PredictionHash], setup: TwinSetup, latest: int
+) -> PredictionHash | None:
+    """Return the last hash up to sample `latest` that states both solvers, None without one."""
     size = setup.solver.rest_state(0).size  # a compiled solver does not check it
-    saved = [
-        entry
-        for entry in hashes
-        if len(entry.free) == len(entry.window) == size and entry.end <= needed
-    ]
-    if not saved:
-        return None
-    start, states = saved[-1].end, (saved[-1].free, saved[-1].window)
-    for block in recording.contiguous_blocks("meas"):
-        before = max(start - setup.history_samples, block.index)
-        if not (block.index <= before < start and covering[-1].end <= block.end):
-            continue
-        twins = resume_twins(setup, states, block.cut(before, start))
-        predicted = advance_twins(setup, twins, block.cut(start, covering[-1].end))[1]
-        values = predicted.values[:, covering[0].index - start :]
-        whole = values[:, :0]
-        again = hash_cells(whole, predicted.end, values, setup.hash_samples, {})[1]
-        if len(again) == len(covering) and all(map(PredictionHash.is_same_output, again, covering)):
-            return predicted.cut(first, end)
-        return None
-    return None
+    fitting = (entry for entry in hashes if len(entry.free) == len(entry.window) == size)
+    return max(
+        (entry for entry in fitting if entry.end <= latest),
+        key=lambda entry: entry.end,
+        default=None,
+    )
 
 
 def is_rig_item(item: Item) -> bool:
