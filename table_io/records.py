@@ -376,10 +376,10 @@ class OrbitPoint:
     that of the sought branch; else `reason` says what is missing. `u_m` are the harmonics U_0,
     U_1, ... as Re U_0, Im U_0, Re U_1, ... with u(t) = Re sum U_k exp(i k phi), where the table's
     acceleration is a sin(phi). `feedback_m` are the amplitudes of harmonics 0, 1, ... of the
-    correction, `noise_m` the part of their root sum of squares that sensor noise explains, and
-    `command_m` is the amplitude of the command. `periods` counts from the change of point.
-    `multiplier` is the largest Floquet multiplier without feedback, `multiplier_sd` its standard
-    deviation.
+    correction, `noise_m` the standard error of their root sum of squares by the scatter between
+    cycles, and `command_m` is the amplitude of the command. `periods` counts from the change of
+    point. `multiplier` is the largest Floquet multiplier without feedback, `multiplier_sd` its
+    standard deviation.
     """
 
     index: int

@@ -91,6 +91,26 @@ def _fit_harmonics(basis: Float2D, normal: Float2D, values: Float1D, harmonics: 
     return HarmonicFit(float(solution[0]), amplitudes, rms)
 
 
+def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> float:
+    """Return the standard error of all harmonics of `track_harmonics`, their root sum of squares.
+
+    From the scatter of offset, sines and cosines between the cycles of `values`, (sample,), at the
+    `phase` in cycles, so noise of any spectrum counts as it passed a control loop. NaN if samples
+    are lost or of less than two cycles.
+    """
+    basis = _harmonic_basis(phase, harmonics)
+    cycles = math.floor(np.ptp(phase) + 0.5) if phase.size else 0
+    if cycles < 2 or not np.isfinite(values).all():
+        return math.nan
+    solution = np.linalg.solve(_normal_matrix(basis), np.einsum("ij,i->j", basis, values))
+    residual = values - np.einsum("ij,j->i", basis, solution)
+    starts = np.searchsorted(phase, phase[0] + np.arange(cycles))
+    means = np.add.reduceat(residual[:, None] * basis, starts)
+    means /= np.diff(np.append(starts, phase.size))[:, None]
+    means[:, 1:] *= 2.0  # the mean square of a sine is a half
+    return float(np.sqrt(means.var(axis=0, ddof=1).sum() / cycles))
+
+
 GAIN_TERMS, PHASE_TERMS = 3, 2
 MAX_GAIN_EXTRAPOLATION = 4.0  # a gain stays within this factor of the identified range
 LSTSQ_RCOND = 1e-3  # points closer together than this do not determine a slope

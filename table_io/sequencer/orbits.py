@@ -47,7 +47,12 @@ from table_io.control.orbit_feedback import (
     ReferenceSegment,
     advance_feedback,
 )
-from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
+from table_io.control.order_tracking import (
+    HarmonicFit,
+    estimate_harmonic_error,
+    evaluate_transfer,
+    track_harmonics,
+)
 from table_io.excitation.trajectory import SineTarget, Trajectory
 from table_io.records import Event, FrequencyResponse, OrbitPoint
 from table_io.sequencer.releases import (
@@ -67,7 +72,7 @@ LEVEL_TOLERANCE = 0.003  # of the fundamental of the table's acceleration
 MAX_LEVEL_FACTOR = 1.25  # of the command in one update
 LATENCY_TOLERANCE_S = 0.003  # of the measured latency, beyond that of the plan
 MAX_LOST_POINTS = 3  # in a row, before the test ends
-NOISE_FACTOR = 1.5  # accepted feedback over what sensor noise explains
+NOISE_FACTOR = 1.5  # accepted feedback over its standard error by the scatter between cycles
 
 
 class Waypoint(NamedTuple):
@@ -308,11 +313,11 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     phase = state.drive.phase(stage.first, stage.last - stage.first)
     table = track_harmonics(window.channel("table_acc_m_s2"), phase, plan.harmonics)
     u_m = relative_displacement(window)
-    fits = [track_harmonics(values, phase, plan.harmonics) for values in (
-        u_m,
-        measure_mass(window),
-        state.drive.correction.displacement(stage.first, stage.last - stage.first),
-    )]  # fmt: skip
+    correction_m = state.drive.correction.displacement(stage.first, stage.last - stage.first)
+    fits = [
+        track_harmonics(values, phase, plan.harmonics)
+        for values in (u_m, measure_mass(window), correction_m)
+    ]
     if not all(np.isfinite(fit.residual_rms) for fit in (table, *fits)):
         return retry_orbit(state, stage.last, "samples were lost")
     response = _table_response(state.tuning.response, target.frequency_hz, plan.harmonics)
@@ -343,11 +348,7 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         )
         return retry_orbit(replace(state, search=search), stage.last, reason)
     command_m = orbit.acceleration_m_s2 * _find_correction(state, target.frequency_hz) / w**2
-    noise_m = (
-        abs(orbit.gain)
-        * fits[1].residual_rms
-        * math.sqrt(2 * (2 * plan.harmonics + 1) / len(window))
-    )
+    noise_m = estimate_harmonic_error(correction_m, phase, plan.harmonics)
     level_ratio = abs(nominal) / orbit.acceleration_m_s2
     reason = _find_fault(config, target, measured, command_m, noise_m, level_ratio)
     has_ended = not reason or target.update >= config.updates

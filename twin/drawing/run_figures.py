@@ -449,7 +449,7 @@ def draw_orbits(run: ReportData) -> CaptionedFigures:
     ]
     feedback_axis.plot(
         [orbit.frequency_hz for orbit in orbits], 100 * np.array(noise), marker="_", ls="",
-        color=GUIDE_COLOUR, label="explained by sensor noise",
+        color=GUIDE_COLOUR, label="noise, by the scatter of cycles",
     )  # fmt: skip
     branch_axis.set_ylabel("amplitude of $u$ in mm")
     feedback_axis.set_ylabel("feedback in % of the command")

@@ -491,7 +491,7 @@ class OrbitResult(Contract):
     feedback_m: RealMetres = Field(description="root of the sum of squares of its harmonics")
     feedback_share: RealRatio = Field(description="the same over the amplitude of the command")
     feedback_harmonics_m: list[RealMetres] = Field(description="amplitudes of harmonics 0, 1, ...")
-    noise_m: RealMetres = Field(description="part of `feedback_m` that sensor noise explains")
+    noise_m: RealMetres = Field(description="standard error of `feedback_m`, by scatter of cycles")
     periods: int = Field(description="since the change of point")
     updates: int = Field(description="changes of the reference")
     accepted: bool = Field(description="the feedback has vanished, on the sought branch")

@@ -78,6 +78,16 @@ def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> 
     assert held.select(RunStop)[0].verdict == "complete"
 
 
+def test_orbit_is_accepted_at_the_noise_that_its_feedback_has() -> None:
+    """The loop passes about twice the noise that white noise of the laser alone would explain."""
+    noisy = play_session(make_profile(slice(1), multiplier_periods=0, tolerance=1e-4))
+    (point,) = noisy.select(OrbitPoint)
+    assert point.accepted
+    assert 1e-4 * point.command_m < math.hypot(*point.feedback_m) <= 1.5 * point.noise_m
+    true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
+    assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=0.002)
+
+
 def test_latency_of_the_feedback_is_stated(held: PlayedSession) -> None:
     (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
     measured_ms = float(event.text.split()[3])

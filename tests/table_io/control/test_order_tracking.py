@@ -8,6 +8,7 @@ import pytest
 from table_io.block import Float1D
 from table_io.control.order_tracking import (
     HARMONIC_COUNT,
+    estimate_harmonic_error,
     evaluate_gain,
     evaluate_transfer,
     track_channels,
@@ -170,3 +171,28 @@ def test_points_too_close_together_determine_no_slope(gap: float, has_slope: boo
         assert beyond == pytest.approx(1.1 * 4.0)  # runs away to its bound
     else:
         assert 0.5 < beyond < 1.5
+
+
+@pytest.mark.parametrize("smoothed", [1, 60])
+def test_error_of_harmonics_is_that_of_repeated_measurements(smoothed: int) -> None:
+    """White noise, and noise through a low-pass of 30 ms, as feedback to the command passes one."""
+    rng, orders = np.random.default_rng(3), 9
+    motion, phase = wave(3.0, 10, [1.0, 0.2j, 0.05], offset=0.1)
+    truth, fits, stated = track_harmonics(motion, phase, orders), [], []
+    for _ in range(60):
+        noise = rng.standard_normal(phase.size + smoothed - 1)
+        values = motion + 0.1 * np.convolve(noise, np.ones(smoothed) / smoothed, "valid")
+        fit = track_harmonics(values, phase, orders)
+        fits.append([fit.offset - truth.offset, *np.abs(fit.amplitudes - truth.amplitudes)])
+        stated.append(estimate_harmonic_error(values, phase, orders))
+    true = np.sqrt(np.mean(np.sum(np.square(fits), axis=1)))
+    assert np.sqrt(np.mean(np.square(stated))) == pytest.approx(true, rel=0.08)
+    assert estimate_harmonic_error(motion, phase, orders) < 1e-12
+
+
+def test_error_of_harmonics_needs_two_cycles_and_every_sample() -> None:
+    values, phase = wave(3.0, 2, [1.0])
+    assert np.isfinite(estimate_harmonic_error(values, phase, 3))
+    assert np.isnan(estimate_harmonic_error(values[:700], phase[:700], 3))
+    values[5] = np.nan
+    assert np.isnan(estimate_harmonic_error(values, phase, 3))
