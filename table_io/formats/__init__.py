@@ -16,6 +16,7 @@ from typing import TextIO
 from table_io.errors import InputError, format_pip_line
 from table_io.formats.lvm import EXPRESS_WORDS, FIRST_WORDS, parse_express, parse_lvm
 from table_io.formats.sandbox import run_isolated
+from table_io.formats.scope import SCOPE_HEAD, SETTINGS_HEAD, parse_scope, parse_settings
 from table_io.formats.strong_motion import (
     KNET_WORDS,
     PEER_SUFFIXES,
@@ -48,7 +49,8 @@ SIGNATURES = {  # first bytes by module; other formats have none that is safe
 }  # fmt: skip
 OTHER_SIGNATURES = {  # what a file is that is not read
     b"\x89PNG": "a PNG image", b"%PDF": "a PDF document", b"\xd0\xcf\x11\xe0": "an old Excel file",
-    b"PK": "a ZIP archive", b"\x89HDF": "an HDF5 file", b"\x1f\x8b": "a gzip archive",
+    b"PK": "a ZIP archive (a workbook is read if named .xlsx)", b"\x89HDF": "an HDF5 file",
+    b"\x1f\x8b": "a gzip archive",
     b"PAR1": "a Parquet file", b"TDSm": "a LabVIEW TDMS file", b"MATLAB": "a MATLAB file",
     b"RIFF": "a WAV sound file", b"\x93NUMPY": "an array of numpy (.npy), to be saved as .npz",
     b"\x80": "a pickle of Python, which is never loaded", b"ARROW1": "an Arrow or Feather file",
@@ -57,6 +59,9 @@ OTHER_SIGNATURES = {  # what a file is that is not read
 OTHER_TEXTS = {  # what a text is that is not read, by its first characters
     rb"\s*<(!doctype html|html)": "an HTML page", rb"\s*<\?xml": "an XML file",
     rb"\s*(\{\s*[\"}]|\[\s*[\[{])": "a JSON file", rb"\{\\rtf": "an RTF document",
+    rb"TIMESERIES \S+, \d+ samples": "a time series of FDSN (SLIST, TSPAIR)",
+    rb"\d{6}[DRQM][ \d]": "a miniSEED file", rb"(BEGIN GSE|WID[12] )": "a GSE file",
+    rb"(un)?corrected accelerogram \S+ GNS": "a record of GeoNet (V1A, V2A)",
 }  # fmt: skip
 UTF_32_MARKS = (b"\xff\xfe\0\0", b"\0\0\xfe\xff")
 UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
@@ -164,6 +169,10 @@ def _parse_lines(file: TextIO, path: Path) -> ForeignTable:
         return parse_volume_2(file, path)
     if first.lower().startswith(EXPRESS_WORDS):
         return parse_express(file, path)
+    if first.lower().startswith(SETTINGS_HEAD) and first.count(",") > 3:
+        return parse_settings(file, path)
+    if SCOPE_HEAD.match(first):
+        return parse_scope(file, path)
     return parse_lvm(file, path) if first.startswith(FIRST_WORDS) else parse_table(file, path)
 
 

@@ -1,12 +1,12 @@
 """Rows of text cells, of a text file or a sheet, as a table of numbers.
 
 An empty cell, "NaN" or one of LOST_MARKS is a lost sample. A column whose first cell is text is no
-column of numbers; elsewhere a cell that is no number is an InputError with file, row and column.
-What stands below the samples and is none is left out.
+column of numbers, nor is one that is empty and has no name; elsewhere a cell that is no number is
+an InputError with file, row and column. What stands below the samples and is none is left out.
 """
 
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +16,17 @@ from table_io.errors import InputError
 from table_io.formats.layout import (
     LOST_MARKS,
     ClockReader,
+    QuantityReader,
     TableLayout,
     is_number,
     parse_number,
+    split_quantity,
     start_at_zero,
     strip_cells,
     use_decimal_point,
 )
 from table_io.formats.table import ForeignTable, make_column
+from table_io.formats.words import normalize_unit
 
 MAX_QUOTED_CHARS = 40  # of a cell in a message
 # Of numbers with marks of thousands that were read as decimals: whole ones, and of the others those
@@ -41,8 +44,12 @@ class _CellReader:
         self._names = layout.column_names
         self._has_commas = layout.has_decimal_commas
         self._has_spare = bool(layout.spare)
+        readers: dict[str, type[ClockReader | QuantityReader]] = {
+            "c": ClockReader,
+            "q": QuantityReader,
+        }
         self._converters: list[Callable[[str], float]] = [
-            ClockReader() if kind == "c" else parse_number for kind in layout.kinds
+            readers[kind]() if kind in readers else parse_number for kind in layout.kinds
         ]
         self.values = array("d")
         self.row_numbers = array("q")
@@ -63,6 +70,11 @@ class _CellReader:
             numbers = [self._parse_cell(k, cell.strip(), number) for k, cell in enumerate(cells)]
         self.values.extend(numbers)
         self.row_numbers.append(number)
+
+    def find_unit(self, k: int) -> str:
+        """Return the unit of the cells of a column, "" if they have none."""
+        converter = self._converters[k]
+        return converter.unit if isinstance(converter, QuantityReader) else ""
 
     def _use_point(self, cell: str, number: int) -> str:
         if "." in cell and is_number(cell):
@@ -87,6 +99,12 @@ class _CellReader:
             self.texts[k] = text[:MAX_QUOTED_CHARS]
             return float("nan")
         where = f"{self._place}: row {number}, column {self._names[k]!r}"
+        if unit := self.find_unit(k):
+            raise InputError(
+                f"{text[:MAX_QUOTED_CHARS]!r} is no number in {unit!r}, as others are",
+                where=where,
+                remedy="export the column in one unit",
+            )
         if is_number(text.replace(",", ".", 1)):
             raise InputError(
                 f"{text!r} has a decimal comma",
@@ -139,7 +157,7 @@ def read_cells(
         rows=row_numbers if skipped else None,
         facts=layout.facts,
     )
-    _add_columns(table, layout, samples.T, reader.texts)
+    _add_columns(table, layout, [*samples.T], reader)
     return table
 
 
@@ -160,20 +178,34 @@ def _hides_thousands(values: Float1D) -> bool:
     )
 
 
+def _is_fraction(layout: TableLayout, samples: Sequence[Float1D], k: int) -> bool:
+    """Return True if a column holds the milliseconds of the dates in the one before it."""
+    is_named = k > 0 and layout.kinds[k - 1] == "c" and "ms" in (
+        layout.units[k], normalize_unit(layout.column_names[k])
+    )  # fmt: skip
+    return is_named and bool(((samples[k] >= 0) & (samples[k] < 1000)).all())
+
+
 def _add_columns(
-    table: ForeignTable, layout: TableLayout, samples: Iterable[Float1D], texts: dict[int, str]
+    table: ForeignTable, layout: TableLayout, samples: Sequence[Float1D], reader: _CellReader
 ) -> None:
     """Add the columns, (row,) each; one that is text or an index, or has a name twice, is none."""
     repeated: dict[str, int] = {}
     for k, (name, values) in enumerate(zip(layout.column_names, samples, strict=True)):
-        column = make_column(np.ascontiguousarray(values), layout.units[k], k + 1)
-        if layout.kinds[k] == "c" and k not in texts:
-            column = make_column(start_at_zero(values), "s", k + 1)
-        is_unnamed = bool(layout.names) and not layout.names[k]
-        if k in texts:
-            table.dropped[name] = f"text, such as {texts[k]!r}"
-        elif is_unnamed and k == 0 and values.size > 1 and (np.diff(values) == 1).all():
-            table.dropped[name] = "without a name, it counts the rows"
+        stated, unit = layout.units[k], reader.find_unit(k)
+        if stated and unit and stated != unit:
+            raise InputError(
+                f"column {name!r} is in {stated} by its head, in {unit} by its cells",
+                where=table.path,
+                remedy="correct one of them",
+            )
+        column = make_column(np.ascontiguousarray(values), stated or unit, k + 1)
+        if layout.kinds[k] == "c" and k not in reader.texts:
+            is_fine = k + 1 < layout.width and _is_fraction(layout, samples, k + 1)
+            times = values + 1e-3 * samples[k + 1] if is_fine else values
+            column = make_column(start_at_zero(times), "s", k + 1)
+        if why := _find_drop_reason(layout, samples, reader, k):
+            table.dropped[name] = why
         elif name not in repeated and _hides_thousands(values):
             table.dropped[name] = "its points or commas may be marks of thousands: export without"
         elif name in repeated:
@@ -188,6 +220,23 @@ def _add_columns(
             table.columns[name] = column
 
 
+def _find_drop_reason(
+    layout: TableLayout, samples: Sequence[Float1D], reader: _CellReader, k: int
+) -> str:
+    """Return why a column holds no samples, or ""."""
+    values = samples[k]
+    is_unnamed = bool(layout.names) and not layout.names[k]
+    if k in reader.texts:
+        return f"text, such as {reader.texts[k]!r}"
+    if k - 1 not in reader.texts and _is_fraction(layout, samples, k):
+        return "the milliseconds of the times before it"
+    if is_unnamed and np.isnan(values).all():
+        return "empty, without a name"
+    if is_unnamed and k == 0 and values.size > 1 and (np.diff(values) == 1).all():
+        return "without a name, it counts the rows"
+    return ""
+
+
 def make_width_error(place: object, row: int, count: int, named: int) -> InputError:
     """Return the error of a row whose cells are not as many as the columns of the header."""
     hint = " (for decimal commas: export with points)" if count == 2 * named else ""
@@ -200,6 +249,6 @@ def make_width_error(place: object, row: int, count: int, named: int) -> InputEr
 
 def _is_remark(cells: Sequence[str], width: int) -> bool:
     """Return True if a row is no sample: words only, or a line of words of another width."""
-    filled = [cell.strip() for cell in cells if cell.strip()]
+    filled = [split_quantity(cell)[0].strip() for cell in cells if cell.strip()]
     is_value = [is_number(cell.replace(",", ".", 1)) for cell in filled]
     return not any(is_value) or (len(cells) != width and not is_value[0])

@@ -26,6 +26,7 @@ Attributes = Mapping[str, str | list[str]]
 Fields = Iterable[tuple[str, Any, Attributes]]
 UNIT_ATTRIBUTES = ("units", "unit", "Units", "Unit", "unit_string")
 FILL_ATTRIBUTES = ("_FillValue", "missing_value")
+FACTOR_ATTRIBUTES = ("gain", "scale", "factor", "sensitivity", "calibration")  # of values, perhaps
 START_ATTRIBUTES = ("start_time", "start_s", "t0")  # numbers in s
 MAX_CHUNK_BYTES = 2**26  # the library always loads whole chunks
 MAX_REFERENCES = 1000  # of a cell array
@@ -33,15 +34,15 @@ MAX_REFERENCES = 1000  # of a cell array
 
 def scan_columns(path: Path) -> ForeignTable:
     """Scan the datasets of a file; values are not read."""
-    table = ForeignTable(path, "", load=load_column)
+    table, notes = ForeignTable(path, "", load=load_column), list[str]()
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and not name.startswith("#"):
-                _add_dataset(table, name, item)
+                _add_dataset(table, name, item, notes)
 
         file.visititems(visit)
-    return table
+    return replace(table, notes=(*notes,))
 
 
 def load_column(path: Path, key: ColumnKey) -> Any:
@@ -61,7 +62,7 @@ def _unpack(values: Any, attributes: Mapping[str, Any]) -> Any:
     return attributes.get("scale_factor", 1.0) * numbers + attributes.get("add_offset", 0.0)
 
 
-def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
+def _add_dataset(table: ForeignTable, name: str, item: Any, notes: list[str]) -> None:
     if item.is_virtual or item.external:
         table.dropped[name] = "its values are in another file"
     elif _chunk_bytes(item) > MAX_CHUNK_BYTES:
@@ -81,6 +82,12 @@ def _add_dataset(table: ForeignTable, name: str, item: Any) -> None:
     else:
         unit = next((_to_text(item.attrs[key]) for key in UNIT_ATTRIBUTES if key in item.attrs), "")
         unit = unit or next(iter(_read_field(item, UNIT_FIELDS)), "")
+        notes += [
+            f"warning: {name} has an attribute {key} = {value:.6g}, which is not applied"
+            for key, value in item.attrs.items()
+            if key.lower() in FACTOR_ATTRIBUTES and np.isreal(value).all() and np.size(value) == 1
+            if value != 1
+        ]
         table.add_array(
             name, item.shape, item.dtype.kind, (name, ""), unit, name.rpartition("/")[0]
         )

@@ -24,7 +24,11 @@ def scan_columns(path: Path) -> ForeignTable:
                 )
                 shape, _, dtype = header(file)
             name = member.removesuffix(".npy")
-            table.add_array(name, shape, dtype.kind, (name,))
+            for field in dtype.names or ():
+                kind = dtype[field].kind if not dtype[field].shape else "V"
+                table.add_array(f"{name}/{field}", shape, kind, (name, field), group=name)
+            if not dtype.names:
+                table.add_array(name, shape, dtype.kind, (name, ""))
             if (fact := find_fact(name)) and dtype.kind in "fiu" and {*shape} <= {1}:
                 with np.load(path, allow_pickle=False) as arrays:
                     add_fact(table.facts, fact, float(arrays[name].item()))
@@ -33,6 +37,7 @@ def scan_columns(path: Path) -> ForeignTable:
 
 def load_column(path: Path, key: ColumnKey) -> Any:
     """Read the values of a column, (row,)."""
-    name, k = key
+    name, field, k = key
     with np.load(path, allow_pickle=False) as arrays:
-        return extract_column(arrays[name], int(k))
+        array = arrays[name]
+        return extract_column(array[field] if field else array, int(k))

@@ -7,9 +7,9 @@ import numpy as np
 from nptdms import TdmsFile
 
 from table_io.formats.table import ColumnKey, ForeignColumn, ForeignTable
-from table_io.formats.words import UNIT_FIELDS
+from table_io.formats.words import UNIT_FIELDS, add_fact, find_fact
 
-UNIT_KEYS = ("unit_string", *UNIT_FIELDS)
+UNIT_KEYS = ("unit_string", "NI_UnitDescription", *UNIT_FIELDS)
 SECOND = np.timedelta64(1, "s")
 
 
@@ -25,6 +25,10 @@ def scan_columns(path: Path) -> ForeignTable:
             for channel in group.channels()
             if "wf_start_time" in channel.properties
         }
+        for place in (file, *file.groups()):
+            for key, value in place.properties.items():
+                if (fact := find_fact(key)) and isinstance(value, (int, float)):
+                    add_fact(table.facts, fact, float(value))
         first = min(begins.values(), default=np.datetime64(0, "us"))
         for group in file.groups():
             for channel in group.channels():

@@ -8,7 +8,7 @@ and empty lines are no samples.
 import csv
 import re
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from itertools import chain, islice
 from pathlib import Path
@@ -17,12 +17,20 @@ from typing import TextIO
 from table_io.channels import CHANNEL_BY_NAME, TIME_COLUMN
 from table_io.errors import InputError
 from table_io.formats.cells import MAX_QUOTED_CHARS, CellRow, make_width_error, read_cells
-from table_io.formats.layout import MAX_HEAD_ROWS, TableLayout, find_layout, is_number
+from table_io.formats.layout import (
+    MAX_HEAD_ROWS,
+    TableLayout,
+    find_layout,
+    is_number,
+    turn_rows,
+)
 from table_io.formats.table import ForeignTable, TableColumns
+from table_io.formats.words import read_facts
 
 BLANKS = " "  # one or more of them, or tabs
 DELIMITERS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 MAX_LINE_CHARS = 1_000_000
+MAX_REMARK_CHARS = 1000  # of a line that states a fact, next to rows of samples
 # With the last one of a file that ends in no line feed: a writer that drops zeros at the end makes
 # one number in ten shorter, so of so many rows some are.
 COMPARED_ROWS = 100
@@ -34,16 +42,33 @@ def parse_table(file: TextIO, path: Path) -> ForeignTable:
     lines = _iter_lines(file, path)
     head = list(islice(lines, MAX_HEAD_ROWS))
     delimiter, layout = _find_layout(head)
+    kind = f"a text table, separated by {DELIMITERS[delimiter]}"
+    if layout is not None and (rows := turn_rows(_separate_head(head, delimiter)[0], layout)):
+        return _parse_turned(rows, head, path, kind)
     if layout is None:  # reports what is wrong with the row after a first row of names
         names = _parse_header(head[0] if head else "", delimiter, path)
         layout = TableLayout((*names,), ("",) * len(names), 1, "n" * len(names))
     elif not layout.names:
         _check_header(layout, head, delimiter, path)
-    rows = _number_rows(chain(head[layout.first_row :], lines), delimiter, layout.first_row, path)
-    table = read_cells(path, f"a text table, separated by {DELIMITERS[delimiter]}", layout, rows)
+    lines = chain(head[layout.first_row :], lines)
+    table = read_cells(path, kind, layout, _number_rows(lines, delimiter, layout.first_row, path))
     notes = [] if delimiter == "," else [f"cells are separated by {DELIMITERS[delimiter]}"]
     notes += ["numbers have decimal commas"] if layout.has_decimal_commas else []
     return replace(table, notes=(*notes, *table.notes))
+
+
+def _parse_turned(
+    rows: Sequence[Sequence[str]], lines: Iterable[str], path: Path, kind: str
+) -> ForeignTable:
+    """Read a table whose channels are in rows, from its columns; `lines` may state facts."""
+    layout = find_layout(rows[:MAX_HEAD_ROWS])
+    if layout is None:
+        raise InputError(f"{kind}, its channels in rows, without samples", where=path)
+    cells = enumerate(rows[layout.first_row :], layout.first_row + 1)
+    table = read_cells(path, f"{kind}, its channels in rows", layout, cells)
+    facts = read_facts(line for line in lines if len(line) < MAX_REMARK_CHARS)
+    note = "its channels are in rows: a row below is a column of the file"
+    return replace(table, notes=(note, *table.notes), facts=facts)
 
 
 def write_csv(names: Iterable[str], windows: Iterable[TableColumns], file: TextIO) -> None:
@@ -97,14 +122,21 @@ def _separate_head(head: list[str], delimiter: str) -> tuple[list[list[str]], li
 def _separate(lines: Iterable[str], delimiter: str) -> Iterator[list[str]]:
     """Yield the cells of each line; none for an empty line."""
     if delimiter == BLANKS:
-        return (line.split() for line in lines)
+        return map(_split_blanks, lines)
     return csv.reader(lines, delimiter=delimiter, skipinitialspace=True)
+
+
+def _split_blanks(line: str) -> list[str]:
+    """Return the words of a line; one in quotes may hold blanks."""
+    if '"' not in line:
+        return line.split()
+    return [quoted or word for quoted, word in re.findall(r'"([^"]*)"|(\S+)', line)]
 
 
 def _separate_words(lines: Iterable[str]) -> Iterator[list[str]]:
     """Yield the cells of lines of a table separated by blanks; names may contain single ones."""
     for line in lines:
-        cells = line.split()
+        cells = _split_blanks(line)
         if any(is_number(cell.replace(",", ".", 1)) for cell in cells):
             yield cells
         else:
@@ -140,7 +172,8 @@ def _check_header(layout: TableLayout, head: list[str], delimiter: str, path: Pa
     """Raise InputError if the row above samples without names has another number of cells."""
     above = next((line for line in reversed(head[: layout.first_row]) if line.strip()), "")
     cells = next(_separate([above], delimiter), [])
-    if delimiter != BLANKS and len(cells) > 1 and above.lstrip()[:1] not in ("#", "%"):
+    is_remark = above.lstrip()[:1] in ("#", "%") or "".join(cells[:1]).rstrip().endswith(":")
+    if delimiter != BLANKS and 1 < len(cells) != layout.width and not is_remark:
         raise make_width_error(path, layout.first_row + 1, layout.width, len(cells))
 
 

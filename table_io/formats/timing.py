@@ -27,6 +27,7 @@ RATE_TOLERANCE = 1e-4  # UFF text has six digits of the sampling interval
 INTERVAL_SPREAD = 0.01  # relative, of the steps of a column of times without a name that tells
 MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 1e6  # of a test on a table or a component
 MAX_PAUSES = 10  # in the notes
+MAX_WRAPPED_SHARE = 0.5  # of the mean square step down a column: that along a row of one series
 PAUSE_SAMPLES = 10  # from which a gap is a pause, after which the clock may stand elsewhere
 MAX_APART_S = 1e4  # of two columns of times that may be those of different channels
 HOUR_S = 3600.0  # by which local clocks are moved for summer time
@@ -77,17 +78,41 @@ def find_time_column(table: ForeignTable, names: Sequence[str]) -> str:
 
 
 def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
-    """Return what is wrong with a column that is one of times by its name, "" without one."""
+    """Return what is wrong with a column that is perhaps one of times, "" without one."""
     for name, why in table.dropped.items():
         if find_quantity(name) == "time":
             return f"column {name!r} is {why}"
-    for name in names:
-        if find_quantity(name, table.columns[name].unit) == "time":
+    quantities = {name: find_quantity(name, table.columns[name].unit) for name in names}
+    for name, quantity in quantities.items():
+        if quantity == "time":
             try:
                 _measure_gaps(table.read_column(name), table)
             except InputError as error:
                 return f"column {name!r}: {error.where.rpartition(': ')[2]}: {error.problem}"
+    for name, quantity in quantities.items():
+        if not quantity and (np.diff(table.read_column(name)) > 0).all():
+            return f"column {name!r} rises throughout, but unevenly, and is no time by its name"
     return ""
+
+
+def describe_wrapped(table: ForeignTable) -> str:
+    """Return that the rows of a table without names continue one another as one series, or "".
+
+    Then a step along a row is smaller than one down a column, which skips as many samples.
+    """
+    names = [*table.columns]
+    sizes = {column.size for column in table.columns.values()}
+    is_unnamed = all(name == f"column {table.columns[name].key[0]}" for name in names)
+    if len(names) < 3 or len(sizes) != 1 or not is_unnamed or table.dropped:
+        return ""
+    samples = np.array([table.read_column(name) for name in names]).T
+    along, down = np.diff(samples.reshape(-1)), np.diff(samples, axis=0)
+    if not np.nanmean(along**2) < MAX_WRAPPED_SHARE * np.nanmean(down**2):
+        return ""
+    return (
+        f"its rows continue one another, a series of {samples.size} values in lines of "
+        f"{len(names)}: write one value a line, or see what format it is"
+    )
 
 
 def find_remark_rate(table: ForeignTable) -> float | None:

@@ -11,12 +11,14 @@ UNIT_SPELLINGS = {
     "centimeter": "cm", "centimetre": "cm", "inch": "in", "inches": "in", '"': "in",
     "feet": "ft", "foot": "ft", "ms-2": "m/s2", "m*s-2": "m/s2",
     "gn": "g", "g's": "g", "gs": "g", "gal": "cm/s2",
-    "g": "g", "cm": "cm", "mm": "mm", "hz": "Hz",
+    "g": "g", "cm": "cm", "mm": "mm", "hz": "Hz", "in": "in", "ft": "ft", "ms": "ms",
+    "kip": "kip", "lbf": "lbf", "kgf": "kgf",
     "newton": "N", "newtons": "N", "n": "N", "kn": "kN", "kips": "kip", "lb": "lbf", "lbs": "lbf",
     "pounds": "lbf", "volt": "V", "volts": "V", "v": "V", "mv": "mV",
     "°c": "degC", "degc": "degC", "celsius": "degC",
     "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "msecs": "ms",
-    "millisecond": "ms", "milliseconds": "ms", "usec": "us", "usecs": "us", "microsecond": "us",
+    "millisecond": "ms", "milliseconds": "ms", "millis": "ms", "micros": "us", "usec": "us",
+    "usecs": "us", "microsecond": "us",
     "microseconds": "us", "nsec": "ns", "nanoseconds": "ns", "minute": "min",
     "minutes": "min", "mins": "min", "h": "hour", "hr": "hour", "hours": "hour", "d": "day",
     "days": "day",
@@ -24,6 +26,7 @@ UNIT_SPELLINGS = {
 TIME_UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "hour": 3600.0, "day": 86400.0,
 }  # fmt: skip
+TIME_NAMES = ("s", "ms", "us")  # units that may be the name of a column
 KNOWN_UNITS = {*UNITS, *TIME_UNITS, "Hz", "-"}
 AMBIGUOUS_ENDINGS = ("d", "h")  # of a name: "acc_d" is not in days
 BRACKETS = re.compile(r"\(([^()]+)\)|\[([^\[\]]+)\]|\{([^{}]+)\}|<([^<>]+)>")
@@ -35,10 +38,11 @@ FACT_NAMES = {
         r"(?:sampling|sample|scan|acquisition|export|output|storage|logging|recording)"
         r"[ _]*(?:rate|frequency|freq)|rate_hz|fs|f_s"
         r"|samples[ _]*per[ _]*second|abtast(?:rate|frequenz)"
+        r"|(?:tasa|frecuencia) de muestreo|frequenza di campionamento"
     ),
     "interval_s": (
         r"(?:sampling|sample|scan|time)[ _]*(?:interval|period|step|increment)(?:_s)?|dt|ts"
-        r"|delta[ _]?t"
+        r"|delta[ _]?t|wf_increment|intervalo de muestreo|passo di campionamento"
     ),
     "mass_kg": r"(?:total|moving|specimen|test|payload)?[ _]*mass(?:_kg)?|m_kg",
 }
@@ -62,7 +66,8 @@ MIN_PREFIX_LETTERS = 4  # "accelero" is an accelerometer
 
 def normalize_unit(unit: str) -> str:
     """Return the unit in canonical spelling if it is known."""
-    text = unit.strip().replace("²", "2").replace("µ", "u").replace("μ", "u")
+    text = re.sub(r"\s+since\s.*", "", unit.strip())  # "seconds since 2026-03-28" of netCDF
+    text = text.replace("²", "2").replace("µ", "u").replace("μ", "u")
     for character in ("^", "**", " ", "(", ")", "[", "]"):
         text = text.replace(character, "")
     if text in KNOWN_UNITS:
@@ -112,6 +117,8 @@ def find_stated_unit(name: str, unit: str = "") -> str:
     if stated or re.search(r"\d", find_bracketed(name)) or FACTOR.search(name):
         return stated
     words = re.split(r"[^a-zA-Z0-9/²]+", name.strip(" )]"))
+    if len(words) == 1 and len(name) > 1 and (alone := normalize_unit(name)) in TIME_NAMES:
+        return alone  # a column named "sec" or "millis"
     if len(words) > 2 and is_unit("/".join(words[-2:])):
         return normalize_unit("/".join(words[-2:]))
     has_unit = len(words) > 1 and is_unit(words[-1]) and words[-1].lower() not in AMBIGUOUS_ENDINGS
@@ -144,8 +151,11 @@ def find_quantity(name: str, unit: str = "") -> str:
     if stated in TIME_UNITS:
         return "time"
     by_unit = QUANTITY_UNITS.get(UNITS[stated][0]) if stated in UNITS else None
-    if by_unit:
-        return by_unit
+    return by_unit or find_named_quantity(name)
+
+
+def find_named_quantity(name: str) -> str:
+    """Return the one quantity that the words of a name tell; "" if there is none, or several."""
     words = split_words(name)
     long_words = [word for word in words if len(word.rstrip("0123456789")) > 1]
     quantities = [key for key, known in QUANTITY_WORDS.items() if matches_words(words, known)]
@@ -173,7 +183,7 @@ def read_facts(lines: Iterable[str]) -> dict[str, float]:
                 add_fact(facts, key, _parse(match[2]), match[1] or match[3])
                 if re.fullmatch(rf"(?:\s+{NUMBER})+\s*", rest := line[match.end() :]):
                     for word in rest.split():  # of further channels
-                        add_fact(facts, key, _parse(word), match[1])
+                        add_fact(facts, key, _parse(word), match[1] or "")
     return facts
 
 

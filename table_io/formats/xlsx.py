@@ -14,7 +14,7 @@ from typing import Any
 import openpyxl
 
 from table_io.formats.cells import CellRow, read_cells
-from table_io.formats.layout import MAX_HEAD_ROWS, find_layout
+from table_io.formats.layout import MAX_HEAD_ROWS, find_layout, turn_rows
 from table_io.formats.table import ForeignTable, check_expansion
 
 
@@ -52,10 +52,17 @@ def _read_sheet(sheet: Any, formula_sheet: Any, path: Path) -> ForeignTable | No
             if isinstance(formula, str) and formula.startswith("=") and not cells[k]:
                 cells[k] = "nan"
                 unsaved.add(k)
-    layout = find_layout([*map(_trim, head)])
+    width = max((len(_trim(row)) for row in head), default=0)
+    texts = [(row + [""] * width)[:width] for row in head]
+    layout = find_layout(texts)
     if layout is None:
         return None
-    below = chain(head[layout.first_row :], ([*map(_format_cell, row)] for row in rows))
+    below: Iterator[Sequence[str]] = chain(
+        head[layout.first_row :], ([*map(_format_cell, row)] for row in rows)
+    )
+    if turned := turn_rows(texts, layout):
+        layout = find_layout(turned[:MAX_HEAD_ROWS]) or layout
+        below = iter(turned[layout.first_row :])
     table = read_cells(
         path, "", layout, _iter_rows(below, layout.first_row, layout.width), sheet.title
     )
@@ -72,10 +79,10 @@ def _read_sheet(sheet: Any, formula_sheet: Any, path: Path) -> ForeignTable | No
     )
 
 
-def _iter_rows(rows: Iterator[list[str]], before: int, width: int) -> Iterator[CellRow]:
+def _iter_rows(rows: Iterator[Sequence[str]], before: int, width: int) -> Iterator[CellRow]:
     """Yield (row number, cells) of the rows that are not empty in the columns of the table."""
     for number, row in enumerate(rows, before + 1):
-        cells = (row + [""] * width)[:width]
+        cells = [*row, *[""] * width][:width]
         if any(cell.strip() for cell in cells):
             yield number, cells
 

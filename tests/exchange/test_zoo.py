@@ -107,6 +107,38 @@ EXPRESS = (
     "channel names:\nDisp (mm)\tForce (N)\nstart times:\n28/03/2026 23:59:59.5\t"
     "28/03/2026 23:59:59.5\ndt:\n0.005000\t0.005000\n"
 )
+HIOKI = (
+    '"File name","WAVE0001.CSV","V1.00"\n"Title comment",""\n"Start trigger time","\'26-03-29"\n'
+    '"CH","CH1","CH2",\n"Mode","DC","DC",\n"Range","500mV","2V",\n"Scaling","On","On",\n'
+)
+YOKOGAWA = (
+    '"Header Size",9\n"Model Name","DL850E"\n"TraceName","Disp","Force"\n"BlockSize",240,240\n'
+    '"VUnit","mm","N"\n"SampleRate",200,200\n"HUnit","s","s"\n"Date","2026/03/29","2026/03/29"\n'
+    '"Time","10:00:00","10:00:00"\n'
+)
+GRAPHTEC = (
+    "Vendor,GRAPHTEC Corporation\nSampling interval,5ms\nStart time,2026-03-29,01:59:59\n"
+    "CH1,Disp,DC,1V,Off,100,-100,mm\nData\nNumber,Date&Time,ms,Disp,Force\nNO.,Time,ms,mm,N"
+)
+KYOWA = (
+    "DCS-100A\nSampling Frequency,200 Hz\nCH No.,CH-1,CH-2\nCH Name,Disp,Force\nRange,OFF,OFF\n"
+    "Unit,mm,N\nTime,Data,Data"
+)
+
+
+def rows_of_channels(mark: str = ",", *, has_units: bool = False) -> str:
+    """Return a table whose channels are in rows."""
+    head = ("Time", "s"), ("Disp", "mm"), ("Force", "N")
+    return "\n".join(
+        mark.join([*(names if has_units else [f"{names[0]} ({names[1]})"]), *map(str, values)])
+        for names, values in zip(head, zip(*ROWS, strict=True), strict=True)
+    )
+
+
+def with_units(mark: str, form: str) -> str:
+    return "\n".join(form.format(t, u, f).replace("|", mark) for t, u, f in ROWS)
+
+
 GOOD: dict[str, str | bytes] = {
     "plain.csv": text("Time (s),Disp (mm),Force (N)"),
     "square.csv": text("Time [s],Disp [mm],Force [N]"),
@@ -265,6 +297,30 @@ GOOD: dict[str, str | bytes] = {
     "two_rates_one_right.csv": text(
         "Sampling rate: 1000 Hz\nExport rate: 200 Hz\nTime (s),Disp (mm),Force (N)"
     ),
+    "hioki.csv": text(f'{HIOKI}"Time","CH1[mm]","CH2[N]",'),
+    "yokogawa.csv": "\n".join([YOKOGAWA, *(f",{u:.7E},{f:.7E}" for _, u, f in ROWS)]),
+    "graphtec.csv": with_stamps(GRAPHTEC, lambda d, k: f"{k},{d:%Y/%m/%d %H:%M:%S},{5 * k % 1000}"),
+    "kyowa.csv": text(KYOWA),
+    "rows.csv": rows_of_channels(), "rows_units.csv": rows_of_channels(";", has_units=True),
+    "unit_cells.csv": "Time,Disp,Force\n" + with_units(",", "{:.4f} s|{:.7f} mm|{:.7f} N"),
+    "unit_cells_no_head.txt": with_units(", ", "{:.4f}s|{:.7f}mm|{:.7f}N"),
+    "unit_cells_commas.csv": "Zeit;Weg;Kraft\n" + comma(
+        with_units(";", "{:.4f} s|{:.7f} mm|{:.7f} N")
+    ),
+    "matlab_datetime.csv": with_stamps(
+        "Time,Disp (mm),Force (N)", lambda d, k: f"{d:%d-%b-%Y %H:%M:%S.%f}"
+    ),
+    "basic_iso.csv": with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"{d:%Y%m%dT%H%M%S.%f}"),
+    "famos.asc": text('"Time" "Disp" "Force"\n"s" "mm" "N"', mark=" "),
+    "capitals.csv": with_scales(
+        "TIME (SEC),DISPLACEMENT (IN),LOAD (KIPS)", 1 / 25.4, 1 / 4448.2216152605
+    ),
+    "micros.csv": with_times("micros,Disp (mm),Force (N)", 5000 * COUNTS),
+    "settings_beside.csv": "\n".join(
+        ["Time (s),Disp (mm),Force (N),,Setting,Value"]
+        + [f"{t:.4f},{u:.7f},{f:.7f},,{'Span,500' if k < 3 else ','}"
+           for k, (t, u, f) in enumerate(ROWS)]
+    ),
     "one.lvm": lvm("One"), "no.lvm": lvm("No"), "multi.lvm": lvm("Multi"),
     "comma.lvm": lvm("One", mark=","), "decimal.lvm": lvm("One", decimal=","),
     "segments.lvm": lvm("One", segments=3), "segments_no.lvm": lvm("No", segments=2),
@@ -339,6 +395,59 @@ BAD: dict[str, tuple[str | bytes, str]] = {
         ),
         "thousands",
     ),
+    "hioki_volts.csv": (
+        text(f'{HIOKI}"Time","CH1[V]","CH2[V]",'),
+        "'CH1[V]' in V, 'CH2[V]' in V: state in a map what each one is, volts with their gain",
+    ),
+    "rigol.csv": (
+        "\n".join(
+            ["X,CH1,CH2,Start,Increment,", "Sequence,Volt,Volt,0.0,5.0E-03"]
+            + [f"{k},{u:.6E},{f:.6E},," for k, (_, u, f) in enumerate(ROWS)]
+        ),
+        "'CH1' in V, 'CH2' in V",
+    ),
+    "rigol_t0.csv": (
+        text("CH1V,CH2V,t0 = 0.0, tInc = 5.0e-3", ((u, f) for _, u, f in ROWS)), "'CH1V', 'CH2V'"
+    ),
+    "tektronix.csv": (
+        "\n".join(
+            f"{key},{t:.6f},{u:.6f},"
+            for key, (t, u, _) in zip(
+                ["Record Length,240,", "Source,CH1,", "Vertical Units,V,", *[",,"] * 237], ROWS,
+                strict=True,
+            )
+        ),
+        "of 'CH1' in V",
+    ),
+    "changing_unit.csv": (
+        "Time,Disp,Force\n"
+        + "\n".join(
+            f"{t:.4f} s,{u:.7f} mm,{f / 1e3 if k > 9 else f:.7f} {'kN' if k > 9 else 'N'}"
+            for k, (t, u, f) in enumerate(ROWS)
+        ),
+        "kN' is no number in 'N'",
+    ),
+    "two_units_in_cells.csv": (
+        "Time,Disp (m),Force\n" + with_units(",", "{:.4f} s|{:.7f} mm|{:.7f} N"),
+        "in m by its head, in mm by its cells",
+    ),
+    "gram_force.csv": (
+        with_scales("Time (s),Disp (mm),Load (g)", 1.0, 1e3 / 9.80665),
+        "of force by its name, of acceleration by its unit g",
+    ),
+    "counter_wraps.csv": (
+        with_times("millis,Disp (mm),Force (N)", (65000 + 5 * COUNTS) % 65536), "time must rise"
+    ),
+    "rounded_days.csv": (
+        with_times("JD,Disp (mm),Force (N)", 2461128.5 + TIME / 86400, "{:.9f}"),
+        "'JD' rises throughout",
+    ),
+    "wrapped.txt": (
+        "\n".join(" ".join(f"{u:.5f}" for u in DISP_MM[k : k + 8]) for k in range(0, 240, 8)),
+        "a series of 240 values in lines of 8",
+    ),
+    "fdsn.txt": ("TIMESERIES XX_A__HNZ_D, 240 samples, 200 sps\n1 2 3\n", "of FDSN"),
+    "geonet.V1A": ("Uncorrected accelerogram 2016_NBLC GNS Science\n1 2 3\n", "of GeoNet"),
     "frames.csv": (
         with_stamps("Time,Disp (mm),Force (N)", lambda d, k: f"00:00:{k // 25:02d}:{k % 25:02d}"),
         "'Time' is text",

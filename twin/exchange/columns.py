@@ -313,7 +313,7 @@ def _select_columns(
         left_out += [mapped.pop(name).column for name in present_labels]
     if not mapped.keys() & known.channels.keys():
         raise InputError(
-            f"no channel in it; its columns: {_abbreviate([*table.columns])}",
+            f"no channel in it; its columns: {abbreviate([*table.columns])}",
             where=table.path,
             allowed=f"one or more of {', '.join(known.channels)}",
         )
@@ -325,7 +325,7 @@ def _select_columns(
     left_out += [
         f"{name} ({why})" for name, why in table.dropped.items() if name not in table.texts
     ]
-    notes += [f"left out: {_abbreviate(left_out)}"] if left_out else []
+    notes += [f"left out: {abbreviate(left_out)}"] if left_out else []
     notes += [f"left out: {twins} columns of a twin; it is recomputed"] if twins else []
     return mapped, notes
 
@@ -343,7 +343,8 @@ def _missing_column_error(table: ForeignTable, name: str, column: str) -> InputE
     )
 
 
-def _abbreviate(names: list[str]) -> str:
+def abbreviate(names: list[str]) -> str:
+    """Return the first names of a list, and how many more."""
     more = (
         f" and {len(names) - MAX_LISTED_COLUMNS} more (all: --list)"
         if len(names) > MAX_LISTED_COLUMNS
@@ -394,7 +395,7 @@ def _find_common_rows(
     firsts = align_starts(table, columns)
     sizes = [column.size - first for column, first in zip(columns, firsts, strict=True)]
     size = min(sizes)
-    lengths = _abbreviate(
+    lengths = abbreviate(
         [f"{source.column}: {c.size}" for source, c in zip(sources.values(), columns, strict=True)]
     )
     notes = []

@@ -21,11 +21,13 @@ from table_io.formats.timing import (
     check_rate,
     describe_other_times,
     describe_unusable_times,
+    describe_wrapped,
     find_remark_rate,
     find_time_column,
     judge_time_unit,
 )
 from table_io.formats.words import (
+    find_named_quantity,
     find_quantity,
     find_stated_unit,
     find_unit,
@@ -39,6 +41,7 @@ from twin.exchange.columns import (
     ColumnMap,
     ColumnSource,
     ImportColumns,
+    abbreviate,
     is_added_column,
 )
 from twin.exchange.plausibility import CHECKED_PAIRS, find_plausible_units, match_unit_pairs
@@ -157,9 +160,11 @@ def propose_map(
     alternatives: dict[str, tuple[str, ...]] = {}
     chosen: dict[str, str] = {name: name for name in names if name in known.channels}
     time_column = find_time_column(table, names)
-    sorted_names = [name for name in names if name not in chosen and name != time_column]
+    clocks = {table.columns[name].clock for name in names}
+    sorted_names = [name for name in names if name not in {*chosen, time_column, *clocks}]
     for quantity, possible in CHANNELS_OF.items():
         group = [name for name in sorted_names if quantities[name] == quantity]
+        questions += filter(None, (_ask_contradiction(table, name, quantity) for name in group))
         bodies = {name: _find_body(name) for name in group}
         for name, body in bodies.items():
             channel = _choose_channel(quantity, body, bodies, chosen)
@@ -191,8 +196,7 @@ def propose_map(
         questions += [question] if question else []
     questions += _ask_other_sampling(table, names)
     if not chosen:
-        questions.append("no column is known by its name or unit: state the columns in a map")
-    clocks = {info.clock for info in infos}
+        questions.append(_ask_columns(table, sorted_names))
     open_names = {*alternatives, *chosen.values(), time_column, *clocks}
     return MapProposal(
         columns=tuple(columns),
@@ -214,10 +218,34 @@ def _find_rate(table: ForeignTable, names: list[str]) -> tuple[float | None, str
     try:
         if rate_hz := find_remark_rate(table):
             return rate_hz, ""
-        wrong = describe_unusable_times(table, names) or "no times and no sampling rate in the file"
+        wrong = describe_unusable_times(table, names) or "no times and no sampling rate found in it"
     except InputError as error:
         wrong = error.problem
     return None, f"{wrong}: state --rate HZ"
+
+
+def _ask_contradiction(table: ForeignTable, name: str, quantity: str) -> str:
+    """Return the question of a column whose name and unit tell two quantities, or ""."""
+    named = find_named_quantity(" ".join(word for word in split_words(name) if len(word) > 1))
+    if named in ("", quantity):
+        return ""
+    unit = find_stated_unit(name, table.columns[name].unit)
+    return f"column {name!r} is of {named} by its name, of {quantity} by its unit {unit}: which?"
+
+
+def _ask_columns(table: ForeignTable, names: list[str]) -> str:
+    """Return the question of a table none of whose columns is known, with its columns."""
+    if not names:
+        return "no column of numbers but of times"
+    if wrapped := describe_wrapped(table):
+        return wrapped
+    units = [find_stated_unit(name, table.columns[name].unit) for name in names]
+    listed = [f"{name!r}{unit and f' in {unit}'}" for name, unit in zip(names, units, strict=True)]
+    gain = ", volts with their gain" if {*units} & {"V", "mV"} else ""
+    return (
+        f"no column is known by its name or unit, of {abbreviate(listed)}: state in a map what "
+        f"each one is{gain}"
+    )
 
 
 def _ask_other_sampling(table: ForeignTable, names: list[str]) -> Iterator[str]:

@@ -42,6 +42,7 @@ from table_io.formats.timing import (
     MAX_INTERVAL_ERROR,
     check_plausible_rate,
     check_rate,
+    describe_wrapped,
     find_remark_rate,
     judge_time_unit,
     measure_rate,
@@ -389,6 +390,8 @@ def _choose_column(table: ForeignTable, name: str, request: SeriesRequest, time_
         return str(request.column)
     if request.column is None and len(names) == 1:
         return names[0]
+    if request.column is None and (wrapped := describe_wrapped(table)):
+        raise InputError(f"{name}: {table.kind}; {wrapped}")
     wrong = ""
     if request.column is not None:
         reason = table.dropped.get(str(request.column), "")

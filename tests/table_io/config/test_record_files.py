@@ -151,6 +151,8 @@ def test_a_csv_without_times_needs_the_step() -> None:
 
 COLUMNS = "".join(f"{v} {v}\n" for v in VALUES)
 TIMES = "".join(f"{0.01 * k:.2f} {v}\n" for k, v in enumerate(VALUES))
+WAVE = np.sin(0.2 * np.arange(96)).reshape(-1, 6)
+WRAPPED = "".join(" ".join(f"{v:.4f}" for v in row) + "\n" for row in WAVE)
 NPTS = "NPTS= 20, DT= .01 SEC"
 
 
@@ -160,6 +162,7 @@ NPTS = "NPTS= 20, DT= .01 SEC"
         (COLUMNS, "x.txt", {"unit": "g", "step_s": 0.01},
          {"problem": "2 columns", "allowed": "column = 1 to 2"}),
         (COLUMNS, "x.txt", {"unit": "g", "step_s": 0.01, "column": 3}, {"allowed": "1 to 2"}),
+        (WRAPPED, "x.txt", {"unit": "g", "step_s": 0.01}, {"problem": "96 values in lines of 6"}),
         (COLUMNS, "x.txt", {"unit": "g"},
          {"where": "x.txt: row 2, time_s", "problem": "must rise", "remedy": "step_s"}),
         (COLUMNS, "x.txt", {"step_s": 0.01, "column": 1}, {"remedy": "cm/s2"}),
