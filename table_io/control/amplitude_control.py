@@ -10,8 +10,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from table_io.config.profile import ControlConfig
-from table_io.control.order_tracking import HarmonicFit, evaluate_transfer
+from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
+from table_io.harmonics import HarmonicFit
 from table_io.records import FrequencyResponse, Step
 
 CANCELLED_ORDERS = (2, 3, 4, 5)  # harmonic orders of the table acceleration

@@ -15,8 +15,8 @@ from table_io.block import Float1D, Float2D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import HarmonicFit, track_channels, track_harmonics
 from table_io.control.sweep_control import combine_levels
+from table_io.harmonics import HarmonicFit, track_channels, track_harmonics
 from table_io.safety.consistency import (
     MAX_CELL_OFFSET_RATIO,
     CellPairFit,

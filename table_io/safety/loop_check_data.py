@@ -16,8 +16,8 @@ import numpy.typing as npt
 from table_io.block import Block, Float1D, Label, finite_std
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import track_channels, track_harmonics
 from table_io.excitation.drive import Drive, Segment
+from table_io.harmonics import track_channels, track_harmonics
 from table_io.safety.consistency import WeakFormPair, compare_motion, make_window
 from table_io.sensor_errors import PairErrors, highpass, solve_errors
 

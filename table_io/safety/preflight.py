@@ -14,7 +14,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.orbit_feedback import MAX_COMMAND_RATIO
-from table_io.control.order_tracking import evaluate_gain
+from table_io.control.table_response import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, HistorySegment, Segment, envelope_acceleration
 from table_io.records import FrequencyResponse, Step

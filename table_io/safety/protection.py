@@ -28,7 +28,7 @@ from table_io.block import Block, Bool2D, Float1D, Float2D, Label
 from table_io.config.excitation import History, history_acceleration
 from table_io.config.profile import NOTCH, Profile
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import evaluate_transfer
+from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.records import FrequencyResponse
 from table_io.safety import cycle_checks

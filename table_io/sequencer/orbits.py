@@ -30,7 +30,6 @@ from table_io.adaptive.continuation import (
     rotate_harmonics,
     table_harmonics,
 )
-from table_io.adaptive.result import mean_swing
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import measure_mass, relative_displacement
 from table_io.config.excitation.continuation import (
@@ -47,13 +46,9 @@ from table_io.control.orbit_feedback import (
     ReferenceSegment,
     advance_feedback,
 )
-from table_io.control.order_tracking import (
-    HarmonicFit,
-    estimate_harmonic_error,
-    evaluate_transfer,
-    track_harmonics,
-)
+from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget, Trajectory
+from table_io.harmonics import HarmonicFit, estimate_harmonic_error, mean_swing, track_harmonics
 from table_io.records import Event, FrequencyResponse, OrbitPoint
 from table_io.sequencer.releases import (
     advance_releases,

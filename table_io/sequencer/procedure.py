@@ -22,14 +22,13 @@ from dataclasses import replace
 import numpy as np
 
 from table_io.adaptive.policy import make_policy
-from table_io.adaptive.result import Decision, StepResult, mean_swing
+from table_io.adaptive.result import Decision, StepResult
 from table_io.block import Block, Float1D, Label, join_blocks
 from table_io.channels import relative_displacement
 from table_io.config.excitation.continuation import Continuation
 from table_io.config.profile import Profile, check_limited_channels
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
-from table_io.control.order_tracking import HARMONIC_COUNT, HarmonicFit, track_harmonics
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, Segment
 from table_io.excitation.trajectory import (
@@ -39,6 +38,7 @@ from table_io.excitation.trajectory import (
     cycles_to_samples,
     start_trajectory,
 )
+from table_io.harmonics import HARMONIC_COUNT, HarmonicFit, mean_swing, track_harmonics
 from table_io.records import Check, Event, Level, Record, Step, StepAdded
 from table_io.safety import loop_check
 from table_io.safety.preflight import check_corrected_drive

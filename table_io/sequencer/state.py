@@ -11,9 +11,9 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.amplitude_control import Tuning
 from table_io.control.orbit_feedback import FeedbackState
-from table_io.control.order_tracking import NO_FIT, HarmonicFit
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import UNCHANGED, SweptPosition, Trajectory
+from table_io.harmonics import NO_FIT, HarmonicFit
 from table_io.records import OrbitPoint, Record, Step, SweepLevel
 from table_io.safety.loop_check_data import PreloadLimits
 

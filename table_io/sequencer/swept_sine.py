@@ -19,7 +19,6 @@ from table_io.block import Label, join_blocks
 from table_io.config.excitation.swept_sine import MAX_DWELLS, SweptSine
 from table_io.config.profile import NOTCH, LimitConfig
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import evaluate_gain, track_channels, track_harmonics
 from table_io.control.sweep_control import (
     LIMIT_SHARE,
     MAX_SWEEP_CORRECTION,
@@ -34,6 +33,7 @@ from table_io.control.sweep_control import (
     list_ratio_points,
     make_curve,
 )
+from table_io.control.table_response import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import RAMP_CYCLES, Drive
 from table_io.excitation.trajectory import (
@@ -45,6 +45,7 @@ from table_io.excitation.trajectory import (
     append_swept,
     start_swept,
 )
+from table_io.harmonics import track_channels, track_harmonics
 from table_io.records import Event, SweepLevel
 from table_io.sequencer.state import MAX_HOLD_S, SequencerState, Stage, SweepSearch
 

@@ -457,6 +457,43 @@ def test_eta_j_takes_the_gap_at_onset_where_the_stated_one_cannot_be(error_m: fl
     assert point.measured.eta_r == pytest.approx(want - error_m / s.u_star_m, abs=1e-3)
 
 
+def test_noise_of_the_laser_raises_neither_eta_d_nor_eta_j() -> None:
+    """Extremes of single cycles lie 8 um further out, by the noise left in their parabola."""
+    s, length = scale(), 769
+    phase = 2 * math.pi * np.arange(length * 60) / length
+    out = np.empty((OUTPUT_COUNT, phase.size))
+    advance_state(rest_state(G4), discretized_params(G4, RATE_HZ), LEVEL * np.sin(phase), out)
+    u, a, right, left = (row[-4 * length :] for row in (out[0], out[2], out[3], -out[4]))
+    starts = range(length, 4 * length, length)
+    points = []
+    for seed in range(8):
+        noisy = u + 30e-6 * np.random.default_rng(seed).standard_normal(u.size)
+        cycles = []
+        for number, start in enumerate(starts):
+            k = slice(start - s.lead_samples, start + length)
+            extremes, _ = cycle_extremes(
+                CycleMotion(noisy[k], a[k], right[k], left[k]), start, s, (False, False)
+            )
+            cycles.append(
+                CycleExtremes(start + length, 0, number, int(Label.MEASURE), length, extremes, None)
+            )
+        step = Step(0, "forward", RATE_HZ / length, LEVEL)
+        table = LEVEL * np.sin(phase[: 3 * length])
+        points.append(
+            [
+                build_prc_point(step, cycles, table, s, (), u_m).measured
+                for u_m in (noisy[length:], np.empty(0))
+            ]
+        )
+    steady, single = (
+        np.array([[p.eta_d, p.eta_r] for p in column if p is not None])
+        for column in zip(*points, strict=True)
+    )
+    true_m = np.array([0.5 * np.ptp(u[length:]), u[length:].max() - 0.002])
+    assert np.abs(s.u_star_m * steady.mean(axis=0) - true_m).max() < 2e-6
+    assert (s.u_star_m * single.mean(axis=0) - true_m).min() > 6e-6
+
+
 def test_without_an_onset_the_stated_gap_stays() -> None:
     still = motion(np.zeros(50), np.zeros(50))
     extremes, _ = cycle_extremes(still, 0, scale(), UNKNOWN_CONTACT)

@@ -20,7 +20,7 @@ from table_io.acquisition.session import OperatorCommand, find_take_back, run_se
 from table_io.backends import open_backend
 from table_io.block import Block, Float1D
 from table_io.clock import ManualClock
-from table_io.control.order_tracking import evaluate_transfer
+from table_io.control.table_response import evaluate_transfer
 from table_io.errors import InputError
 from table_io.records import Event, FrequencyResponse, OrbitPoint, RunStop
 from table_io.units import GRAVITY_M_S2

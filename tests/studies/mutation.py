@@ -52,6 +52,7 @@ class Target:
     uncompiled: bool = False
 
 
+TRACKING = ("harmonics", "control/table_response", "control/amplitude_control")
 TARGETS = {
     "consistency": Target(
         ("table_io/safety/consistency.py",),
@@ -100,11 +101,8 @@ TARGETS = {
         ("tests/table_io/backends/test_*.py",),
     ),
     "tracking": Target(
-        tuple(f"table_io/control/{name}.py" for name in ("order_tracking", "amplitude_control")),
-        tuple(
-            f"tests/table_io/control/test_{name}.py"
-            for name in ("order_tracking", "amplitude_control")
-        ),
+        tuple(f"table_io/{name}.py" for name in TRACKING),
+        tuple(f"tests/table_io/{Path(name).parent}/test_{Path(name).name}.py" for name in TRACKING),
     ),
     "calibration": Target(
         ("table_io/config/calibration*.py", "twin/rig/calibrate.py"),

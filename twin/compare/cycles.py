@@ -2,7 +2,8 @@
 
 Measurement and twin go through the same functions, so an estimator's bias cancels in the
 comparison. Peaks come from a short least-squares parabola, a tenth of the shortest half period of
-the contact, so that noise does not raise them and contacts are not smeared.
+the contact, so that noise hardly raises them and contacts are not smeared. Where all cycles are
+alike, the peaks of the measured u are those of its harmonics, which noise does not raise.
 """
 
 import math
@@ -13,6 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from table_io.block import Float1D, Float2D, Label
+from table_io.harmonics import find_steady_extremes
 from table_io.records import CycleExtremes, Extremes, NormalizedResponse, PrcPoint, Step
 from table_io.units import GRAVITY_M_S2
 from twin.model.parameters import Parameters
@@ -123,6 +125,7 @@ def cycle_extremes(
 
 OnsetDepths = tuple[Float2D, Float2D]  # (right, left), each (2, onset) in m
 NO_ONSETS: OnsetDepths = (np.empty((2, 0)), np.empty((2, 0)))
+NO_SAMPLES: Float1D = np.empty(0)
 
 
 def extract_onset_depths(motion: CycleMotion, extremes: Extremes | None, first: int) -> OnsetDepths:
@@ -184,12 +187,15 @@ def _impacts_per_cycle(
 
 
 def normalized_response(
-    cycles: list[CycleExtremes], source: str, scale: PrcScale
+    cycles: list[CycleExtremes],
+    source: str,
+    scale: PrcScale,
+    steady_m: tuple[float, float] | None = None,
 ) -> NormalizedResponse | None:
     """Return the ratios of Eq. 1 over the measured cycles of a step; None without a whole one.
 
-    `source` is "measured" or "twin". Quantities of a lost sensor are NaN, without impacts;
-    deformations then come from the displacement alone.
+    `source` is "measured" or "twin", `steady_m` (max u, min u) of cycles that are alike. Quantities
+    of a lost sensor are NaN, without impacts; deformations then come from the displacement alone.
     """
     used = [c for c in cycles if c.label == Label.MEASURE and getattr(c, source) is not None]
     if not used:
@@ -200,6 +206,7 @@ def normalized_response(
     has_forces = all(np.isfinite(e.force_r + e.force_l) for e in used_extremes)
     p, u_star = scale.parameters, scale.u_star_m
     eta = np.array([(e.u_max - e.u_min) / (2 * u_star) for e in used_extremes])
+    motions = [(e, steady_m or (e.u_max, e.u_min)) for e in used_extremes]
     eta_a = np.array([(e.a_max - e.a_min) / (2 * scale.a_star_m_s2) for e in used_extremes])
     weight = p.mass * GRAVITY_M_S2
 
@@ -212,10 +219,10 @@ def normalized_response(
         return 0.0 if force <= scale.contact_n else force / weight
 
     return NormalizedResponse(
-        eta_d=float(eta.mean()),
+        eta_d=float(np.mean([top - low for _, (top, low) in motions]) / (2 * u_star)),
         eta_a=float(eta_a.mean()),
-        eta_r=float(np.mean([deformation(e.u_max - gap_r, e.force_r) for e in used_extremes])),
-        eta_l=float(np.mean([deformation(-e.u_min - gap_l, e.force_l) for e in used_extremes])),
+        eta_r=float(np.mean([deformation(top - gap_r, e.force_r) for e, (top, _) in motions])),
+        eta_l=float(np.mean([deformation(-low - gap_l, e.force_l) for e, (_, low) in motions])),
         r_r=float(np.mean([ratio(e.force_r) for e in used_extremes])),
         r_l=float(np.mean([ratio(e.force_l) for e in used_extremes])),
         impacts_right=_impacts_per_cycle(
@@ -269,19 +276,22 @@ def build_prc_point(
     base_acc: Float1D,
     scale: PrcScale,
     onsets: Sequence[OnsetDepths] = (),
+    u_m: Float1D = NO_SAMPLES,
 ) -> PrcPoint:
     """Build the PRC point of a step from its held cycles; `base_acc` of the measured ones.
 
-    `onsets` are those of the measurement, which correct its gaps and with them eta_j.
+    `onsets` are those of the measurement, which correct its gaps and with them eta_j; `u_m` is the
+    measured u over all measured cycles, (sample,).
     """
     scale = replace(scale, gaps_m=correct_gaps(scale, onsets))
     peak, fundamental, thd = measure_table_motion(base_acc, step.frequency_hz, scale.rate_hz)
+    phase = step.frequency_hz / scale.rate_hz * np.arange(u_m.size, dtype=np.float64)
     return PrcPoint(
         cycles[-1].index,
         step.index,
         step.direction,
         step.frequency_hz,
-        normalized_response(cycles, "measured", scale),
+        normalized_response(cycles, "measured", scale, find_steady_extremes(u_m, phase)),
         normalized_response(cycles, "twin", scale),
         peak,
         fundamental,

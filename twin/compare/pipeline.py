@@ -86,6 +86,7 @@ class PipelineState:
     cycle_blocks: tuple[CycleBlocks, ...] = ()
     cycles: tuple[CycleExtremes, ...] = ()  # of the current step
     base_acc: tuple[Float1D, ...] = ()  # of its measured cycles
+    u_m: tuple[Float1D, ...] = ()  # the same, measured
     onsets: tuple[OnsetDepths, ...] = ()  # of its held cycles, measured
     contact: tuple[ContactState, ContactState] = (
         UNKNOWN_CONTACT,
@@ -362,9 +363,10 @@ def _evaluate_cycle(
     )
     label = int(measured.label[lead])
     cycle = CycleExtremes(end, step, number, label, end - first, measured_extremes, twin_extremes)
-    base_acc = state.base_acc
+    base_acc, u_m = state.base_acc, state.u_m
     if label == Label.MEASURE:
         base_acc = (*base_acc, measured.channel("table_acc_m_s2")[lead:])
+        u_m = (*u_m, measured_motion.u[lead:])
     recorded, cycle_block = measured.cut(first, end), no_low_cuts.cut(first, end)
     sensors = setup.twin.model.sensors
     cycle_data = CycleData(
@@ -382,6 +384,7 @@ def _evaluate_cycle(
         state,
         cycles=(*state.cycles, cycle),
         base_acc=base_acc,
+        u_m=u_m,
         onsets=(
             *state.onsets,
             extract_onset_depths(measured_motion, measured_extremes, measured.index),
@@ -401,8 +404,8 @@ def _evaluate_step(
     measured_cycles = sum(cycle.label == Label.MEASURE for cycle in state.cycles)
     step = setup.find_step(state.cycles[-1].step)
     if step is not None and measured_cycles == setup.measured_cycles:
-        base_acc = np.concatenate(state.base_acc)
-        point = build_prc_point(step, list(state.cycles), base_acc, setup.scale, state.onsets)
+        base_acc, u_m = np.concatenate(state.base_acc), np.concatenate(state.u_m)
+        point = build_prc_point(step, list(state.cycles), base_acc, setup.scale, state.onsets, u_m)
         items.append(point)
         if step not in setup.added_steps:
             monitoring_state, events = monitoring.monitor_step(
@@ -414,6 +417,7 @@ def _evaluate_step(
         state,
         cycles=(),
         base_acc=(),
+        u_m=(),
         onsets=(),
         contact=(UNKNOWN_CONTACT, UNKNOWN_CONTACT),
         monitoring=monitoring_state,

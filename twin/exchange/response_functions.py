@@ -13,7 +13,7 @@ import numpy as np
 
 from table_io.block import Float1D, Float2D, Label
 from table_io.channels import TIME_COLUMN
-from table_io.control.order_tracking import Complex1D, track_harmonics
+from table_io.harmonics import Complex1D, track_harmonics
 from twin.exchange.columns import is_added_column
 from twin.recording.tabular import DIRECTION_SIGNS, LogTable
 

@@ -13,11 +13,11 @@ import pytest
 from table_io.adaptive.jump_refinement import choose_part
 from table_io.adaptive.policy import describe_adaptive_test, make_policy
 from table_io.adaptive.resonance_tracking import interpolate_phase_crossing, parabola_vertex
-from table_io.adaptive.result import Decision, StepResult, mean_swing
+from table_io.adaptive.result import Decision, StepResult
 from table_io.block import Block, Float1D, Label
 from table_io.config.base import PROFILES_DIR, load_config
 from table_io.config.profile import Profile
-from table_io.control.order_tracking import HARMONIC_COUNT, NO_FIT, HarmonicFit
+from table_io.harmonics import HARMONIC_COUNT, NO_FIT, HarmonicFit, mean_swing
 from table_io.records import Event, Record, Step, StepAdded
 from table_io.sequencer.procedure import (
     advance_test,

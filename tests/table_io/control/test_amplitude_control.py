@@ -9,8 +9,9 @@ import pytest
 from table_io.block import Label
 from table_io.config.profile import ControlConfig
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
-from table_io.control.order_tracking import HarmonicFit, evaluate_transfer, track_harmonics
+from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
+from table_io.harmonics import HarmonicFit, track_harmonics
 from table_io.records import FrequencyResponse, Level, Step
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_profile

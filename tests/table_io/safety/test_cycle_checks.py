@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from table_io.block import Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import evaluate_transfer
+from table_io.control.table_response import evaluate_transfer
 from table_io.records import FrequencyResponse
 from table_io.safety import cycle_checks, protection
 from table_io.safety.consistency import SENSOR_PAIRS, WeakFormPair, compare_motion

@@ -20,7 +20,7 @@ from table_io.config.calibration import command_to_volts, compute_tare, measure_
 from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
-from table_io.control.order_tracking import evaluate_transfer
+from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory, start_trajectory
 from table_io.records import Check

@@ -1,13 +1,8 @@
-"""Order tracking: least-squares fit of harmonics at the phase of the drive, and the table's FRF.
+"""Order tracking: least-squares fit of harmonics at the phase of the drive; swing and errors.
 
 x(t) = offset + sum over k of Im(c_k exp(2 pi i k phase)), so a real c_1 is in phase with the
 acceleration sine of the drive. The phase is the closed form of the drive at each sample, so only
 amplitudes are estimated, and a cycle need not be a whole number of samples.
-
-The FRF is interpolated and extrapolated from the identified frequencies. Two quantities are nearly
-polynomials for any displacement servo: 1 / gain^2 in f^2 (exactly, of second degree, for a loop
-with two poles) and the phase, odd in f, linear where a delay dominates. Up to three terms of the
-first and two of the second are fitted, limited by the number of points.
 """
 
 import math
@@ -17,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
-from table_io.records import FrequencyResponse
 
 HARMONIC_COUNT = 10
 Complex1D = npt.NDArray[np.complex128]
@@ -111,51 +105,49 @@ def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> 
     return float(np.sqrt(means.var(axis=0, ddof=1).sum() / cycles))
 
 
-GAIN_TERMS, PHASE_TERMS = 3, 2
-MAX_GAIN_EXTRAPOLATION = 4.0  # a gain stays within this factor of the identified range
-LSTSQ_RCOND = 1e-3  # points closer together than this do not determine a slope
+SWING_HARMONICS = 30  # of u: an impact on a bumper takes a tenth of a cycle or more
+MIN_HARMONIC_SIGMA = 3.0  # standard errors below which a harmonic is noise
+SWING_PHASES = 720  # of a cycle, at which the extremes are looked for: 1e-5 of the swing
+MAX_UNREPEATED = 0.004  # of the swing: rms beyond the noise of what the harmonics leave
+NOISE_ERROR = 5.0  # over the root of the samples: three standard errors of the noise's mean square
 
 
-def evaluate_transfer(response: FrequencyResponse, frequency_hz: float) -> complex:
-    """Evaluate the complex FRF, table acceleration over command, at a frequency in Hz."""
-    frequencies = np.array(response.frequencies_hz)
-    top = float(frequencies.max())
-    powers = 2 * np.arange(min(PHASE_TERMS, frequencies.size)) + 1
-    coefficients = _solve_least_squares(
-        (frequencies / top)[:, None] ** powers, np.array(response.phase_rad)
-    )
-    angle = float(coefficients @ (frequency_hz / top) ** powers)
-    return evaluate_gain(response, frequency_hz) * complex(math.cos(angle), math.sin(angle))
+def mean_swing(u: Float1D, phase: Float1D) -> float:
+    """Return half of max u - min u in m, over whole cycles of `phase`; NaN if any is lost.
 
-
-def evaluate_gain(response: FrequencyResponse, frequency_hz: float) -> float:
-    """Evaluate the gain of the table, acceleration over command, at a frequency in Hz.
-
-    Below the identified band it is constant, because a servo is flat there. Above it 1 / gain^2
-    continues linearly in f^2, because the curvature from a few points is mostly noise.
+    Of the harmonics of the motion: extremes of single cycles are larger by the noise of the
+    sensor. Where the cycles differ, the mean of their extremes.
     """
-    frequencies = np.array(response.frequencies_hz)
-    inverse = np.array(response.gain) ** -2.0
-    low, top = float(frequencies.min()), float(frequencies.max())
-    z = (frequencies / top) ** 2
-    curve = _fit_polynomial(z, inverse, min(GAIN_TERMS, frequencies.size))
-    value = _evaluate_polynomial(curve, min(max(frequency_hz, low), top) / top)
-    if frequency_hz > top:
-        chord = _fit_polynomial(z, inverse, min(2, frequencies.size))
-        value += _evaluate_polynomial(chord, frequency_hz / top) - _evaluate_polynomial(chord, 1.0)
-    min_inverse = float(inverse.min()) / MAX_GAIN_EXTRAPOLATION**2
-    max_inverse = float(inverse.max()) * MAX_GAIN_EXTRAPOLATION**2
-    return float(min(max(value, min_inverse), max_inverse) ** -0.5)
+    ends = find_steady_extremes(u, phase)
+    return _mean_range(u, phase) if ends is None else 0.5 * (ends[0] - ends[1])
 
 
-def _fit_polynomial(z: Float1D, values: Float1D, terms: int) -> Float1D:
-    """Fit a polynomial to values at z, (point,), by least squares; coefficients, (terms,)."""
-    return _solve_least_squares(z[:, None] ** np.arange(terms), values)
+def find_steady_extremes(u: Float1D, phase: Float1D) -> tuple[float, float] | None:
+    """Return (max u, min u) in m of the harmonics of u, (sample,), over whole cycles of `phase`.
+
+    None if samples are lost, or where cycles or higher harmonics differ by more than the noise.
+    """
+    fit = track_harmonics(u, phase, SWING_HARMONICS)
+    if not math.isfinite(fit.residual_rms):
+        return None
+    error = fit.residual_rms * math.sqrt(2.0 / u.size)
+    kept = np.where(np.abs(fit.amplitudes) > MIN_HARMONIC_SIGMA * error, fit.amplitudes, 0.0)
+    turns = np.exp(2j * np.pi * np.arange(SWING_PHASES) / SWING_PHASES)
+    motion = np.polyval([*kept[::-1], 0.0], turns).imag
+    high, low = fit.offset + float(motion.max()), fit.offset + float(motion.min())
+    # White noise of unit rms has a third difference of rms sqrt(20); the motion itself has none.
+    square = float(np.mean(np.diff(u, 3) ** 2)) / 20.0 * (1.0 + NOISE_ERROR / math.sqrt(u.size))
+    allowed = math.hypot(math.sqrt(square), 0.5 * MAX_UNREPEATED * (high - low))
+    return (high, low) if fit.residual_rms <= allowed else None
 
 
-def _evaluate_polynomial(coefficients: Float1D, ratio: float) -> float:
-    return float(coefficients @ ratio ** (2 * np.arange(coefficients.size)))
-
-
-def _solve_least_squares(basis: Float1D, values: Float1D) -> Float1D:
-    return np.asarray(np.linalg.lstsq(basis, values, rcond=LSTSQ_RCOND)[0], dtype=np.float64)
+def _mean_range(u: Float1D, phase: Float1D) -> float:
+    """Return half of max u - min u in m of each cycle, averaged; NaN if any is lost."""
+    if not u.size:
+        return math.nan
+    cycles = np.floor(phase - phase[0] + 1e-9)
+    starts = np.flatnonzero(np.diff(cycles, prepend=-1.0))
+    ranges = np.maximum.reduceat(u, starts) - np.minimum.reduceat(u, starts)
+    # A cycle need not be a whole number of samples: the window may end with a sample of the next.
+    complete = np.diff(np.append(starts, u.size)) > 0.5 * u.size / starts.size
+    return float(0.5 * ranges[complete].mean())
