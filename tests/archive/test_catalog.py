@@ -308,6 +308,12 @@ def test_the_page_filters_sorts_compares_and_shows_trends(archive: Path, tmp_pat
         assert note == f"shaketwin note '{archive / 'year/month/run1'}'"
         circles = "document.querySelectorAll('#trend circle').length"
         assert browser.evaluate(circles) == 4
+        browser.open(page.as_uri(), width=1280, dark=False)
+        assert browser.evaluate("table.parentNode.scrollWidth <= table.parentNode.clientWidth")
+        browser.evaluate("for (let k = 0; k < 60; k++) table.append(lines[3].cloneNode(true))")
+        browser.evaluate("box(lines[0]).click()")
+        end = "document.getElementById('chosen').getBoundingClientRect().bottom"
+        assert browser.evaluate(f"{end} <= innerHeight"), "what was chosen is out of sight"
         assert browser.console == []
 
 

@@ -195,7 +195,7 @@ def propose_map(
         rate_hz, question = _find_rate(table, names)
         questions += [question] if question else []
     questions += _ask_other_sampling(table, names)
-    if not chosen:
+    if not (chosen or alternatives):
         questions.append(_ask_columns(table, sorted_names))
     open_names = {*alternatives, *chosen.values(), time_column, *clocks}
     return MapProposal(
