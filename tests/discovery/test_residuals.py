@@ -8,7 +8,14 @@ import pytest
 
 from tests.discovery.played import SNM, format_truth, log
 from twin.discovery.nuisances import resolve_samples
-from twin.discovery.parameters import EffectKey, ParameterKey, ParameterSet
+from twin.discovery.parameters import (
+    STIFFNESS,
+    EffectKey,
+    GapKey,
+    ParameterKey,
+    ParameterSet,
+    TareKey,
+)
 from twin.discovery.residuals import CONTACT_ROWS, FORCE_ROWS, PULL_ROWS, build_log_residuals
 
 
@@ -38,6 +45,33 @@ def test_forces_at_the_used_samples_are_those_of_the_whole_motion(
         expected = whole[row][residuals.row_mask[row]] / noise[row]
         assert expected.size
         np.testing.assert_array_equal(rows[entry_row == row], expected)
+
+
+def test_residuals_do_not_depend_on_what_was_evaluated_before() -> None:
+    """Forces of the last models are kept, as most parameters of a fit change none."""
+    prepared = log()
+    pair = (prepared.signals, prepared.contact_n)
+    (residuals,) = build_log_residuals([pair], SNM)
+    start = ParameterSet.from_model(SNM, 1)
+    changes: list[dict[ParameterKey, float]] = [
+        {},
+        {STIFFNESS: 4e4},
+        {TareKey(0, "u"): 1e-4},
+        {TareKey(0, "acc"): 0.01},
+        {TareKey(0, "acc"): 0.01, EffectKey("bouc_wen", "force"): 50.0,
+         EffectKey("bouc_wen", "yield_displacement"): 1e-3},
+        {GapKey(0): 2e-4},
+        *({STIFFNESS: 1e3 * k} for k in range(50, 60)),
+        {},
+    ]  # fmt: skip
+    results = []
+    for change in changes:
+        parameters = start.with_values(change)
+        results.append(residuals.evaluate(parameters))
+        (fresh,) = build_log_residuals([pair], SNM)
+        np.testing.assert_array_equal(results[-1], fresh.evaluate(parameters))
+    different = {entries.tobytes() for entries in results}
+    assert len(different) == len(changes) - 1  # the last is the first
 
 
 def test_ringing_before_a_step_of_the_force_is_neither_contact_nor_tension() -> None:

@@ -79,10 +79,10 @@ class FrequencyGrid:
         return float(np.sqrt(np.sum(gain**2) / (self.padded_size / 2 + 1)))
 
 
-def exclude_margins(good: Bool2D, margin: int) -> Bool2D:
-    """Return the good samples without a lost one within `margin` samples, (sample,)."""
-    if good.all():
-        return good.copy()
-    spread = np.convolve(~good, np.ones(2 * margin + 1), "same") > 0
-    usable: Bool2D = ~spread
+def exclude_margins(good: Bool2D, before: int, after: int) -> Bool2D:
+    """Return the samples, (sample,), that are good with as many before and after them."""
+    lost = np.concatenate([[0], np.cumsum(~good)])
+    sample = np.arange(good.size)
+    first, end = np.maximum(sample - before, 0), np.minimum(sample + after + 1, good.size)
+    usable: Bool2D = lost[end] == lost[first]
     return usable

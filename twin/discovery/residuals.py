@@ -24,6 +24,7 @@ from scipy.ndimage import binary_opening
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from twin.compare.spectra import exclude_margins
 from twin.discovery.facts import BlockBasis
 from twin.discovery.motion import (
     ConsistencyResidual,
@@ -62,6 +63,7 @@ MIN_CHANGES = 8  # values of a step that show the noise
 CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
+MAX_KNOWN_FORCES = 8  # of the models last evaluated, which limits memory
 # Power of a bumper's force over the noise of its row, up to the highest frequency of its facts:
 # with less, noise of the motion would shift its slopes by a larger share than the inverse.
 MIN_FACT_RATIO = 16.0
@@ -101,19 +103,32 @@ class NuisanceTerms:
         return np.array([parameters.values.get(key, 0.0) for key in self.keys])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsistencyEntries:
+    """Entries of a consistency residual over their noise, (entry,).
+
+    `slope` is their change per m/s2 of a tare error of the accelerometer, (entry,).
+    """
+
+    body: str
+    values: Float1D
+    slope: Float1D
+
+
 @dataclass(frozen=True, eq=False)
 class SampledMotion:
     """Motion at the samples where forces are needed, and whole: some depend on its history.
 
-    `contact` (2, sample) is the contact state at these samples, and `consistency` are the
-    consistency residuals, each at the samples of its own row.
+    `contact` (2, sample) is the contact state at these samples. `known_forces` are those of the
+    last models and tare errors of u: most parameters of a fit change no force, or that alone.
     """
 
     whole: MeasuredMotion
     samples: Int1D | slice
     m: MeasuredMotion
     contact: npt.NDArray[np.int8]
-    consistency: tuple[ConsistencyResidual, ...] = ()
+    consistency: tuple[ConsistencyEntries, ...] = ()
+    known_forces: list[tuple[Model, float, Float2D]] = field(default_factory=list)
 
     @cached_property
     def largest_pushes(self) -> tuple[float, float]:
@@ -209,14 +224,10 @@ class LogResiduals:
         used[0] = m.moving & np.isfinite(self.measured_forces(m, m.mass_kg)[0])
         margin_s = max(CONTACT_MARGIN_S, FILTER_SETTLING_CYCLES / self.signals.filter_hz)
         margin = max(round(margin_s * m.rate_hz), 1)
-        window = np.ones(2 * margin + 1)
         if m.has_load_cells and m.damper is None:
             for row in range(2):
                 in_contact = self.contact_state[row] > 0
-                used[1 + row] = (
-                    m.moving & in_contact & (np.convolve(~in_contact, window, "same") == 0)
-                )
-        recent = np.concatenate([np.zeros(margin), np.ones(margin + 1)])
+                used[1 + row] = m.moving & exclude_margins(in_contact, margin, margin)
         contact = self.contact_state
         if (contact < 0).any():  # without load cells, as the model expects
             forces = forces_along(self.reference_for(m), m.u, m.v, m.table_acc, m.time_s, contact)[
@@ -224,16 +235,15 @@ class LogResiduals:
             ]
             contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
         change = np.abs(np.diff(contact, axis=1, prepend=contact[:, :1])).any(axis=0)
-        smooth = np.convolve(change, window, "same") == 0
+        smooth = exclude_margins(~change, margin, margin)
         if contact is not self.contact_state:
             used[0] &= smooth
         for row, name in enumerate(self.rows):
             if name in PULL_ROWS:
-                in_contact = self.contact_state[PULL_ROWS.index(name)] > 0
-                was_in_contact = np.convolve(in_contact, recent, "same") > 0
+                is_free = self.contact_state[PULL_ROWS.index(name)] <= 0
+                was_free = exclude_margins(is_free, margin, 0)
                 # a filter of linear phase rings before the step of the force at touch, too
-                will_be_in_contact = np.convolve(in_contact, recent[::-1], "same") > 0
-                used[row] = m.moving & ~in_contact & was_in_contact & ~will_be_in_contact
+                used[row] = m.moving & ~was_free & exclude_margins(is_free, 0, margin)
             elif row >= len(FORCE_ROWS):
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
@@ -302,11 +312,10 @@ class LogResiduals:
         """Return what the residual needs of a motion; the most recent ones are cached."""
         sampled = next((known for known in self._sampled_motions if known.whole is m), None)
         if sampled is None:
-            samples, residuals = self._used_samples, m.consistency_residuals
-            rows = self._row_samples[len(FORCE_ROWS) :][: len(residuals)]
+            samples = self._used_samples
             consistency = tuple(
-                replace(residual, values=residual.values[row])
-                for residual, row in zip(residuals, rows, strict=True)
+                self._enter_consistency(row, residual)
+                for row, residual in enumerate(m.consistency_residuals, len(FORCE_ROWS))
             )
             sampled = SampledMotion(
                 m, samples, m.select(samples), self.contact_state[:, samples], consistency
@@ -581,6 +590,16 @@ class LogResiduals:
     ) -> Float2D:
         """Return D, F_R >= 0 and F_L <= 0 of a model in N, (3, used)."""
         zero_error = parameters.tare_error(self.log_number, "u")
+        latest = [*sampled.known_forces]
+        known = [each for each in latest if each[1] == zero_error and each[0] == model]
+        forces = known[0][2] if known else self._compute_forces(model, zero_error, sampled)
+        kept = [each for each in latest if each[2] is not forces][: MAX_KNOWN_FORCES - 1]
+        # a single assignment, because other threads may be reading
+        sampled.known_forces[:] = [(model, zero_error, forces), *kept]
+        return forces
+
+    def _compute_forces(self, model: Model, zero_error: float, sampled: SampledMotion) -> Float2D:
+        """Return `_model_forces` for a tare error of u in m."""
         if self._knows_contact and not depends_on_history(model):
             m, contact = sampled.m, sampled.contact
         else:
@@ -608,13 +627,17 @@ class LogResiduals:
             # the second derivative at an open end is no force, and the filter would spread it
             damper = np.where(m.good, forces[0] / self.signals.mass_kg, 0.0)
             rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
-        rows += [self._correct_consistency(c, parameters) for c in sampled.consistency]
+        entries = [self._enter_row(row, values) for row, values in enumerate(rows)]
+        entries += [self._correct_consistency(c, parameters) for c in sampled.consistency]
         if m.has_load_cells and m.damper is None:
-            rows += self._pull_rows(sampled, parameters, forces)
-        return [
-            (row if basis is None else basis.project(row)) / noise
-            for row, basis, noise in zip(rows, self.bases, self._row_noise, strict=True)
-        ]
+            pulls = self._pull_rows(sampled, parameters, forces)
+            entries += [self._enter_row(row, v) for row, v in enumerate(pulls, len(entries))]
+        return entries
+
+    def _enter_row(self, row: int, values: Float1D) -> Float1D:
+        """Return the entries of a row over their noise, (entry,), from its samples, (sample,)."""
+        basis = self.bases[row]
+        return (values if basis is None else basis.project(values)) / self._row_noise[row]
 
     @cached_property
     def _louder_signals(self) -> LogSignals:
@@ -865,26 +888,36 @@ class LogResiduals:
         """Return entries over the noise, (entry,), from the samples of the force rows."""
         entries = np.zeros(self.entry_row.size)
         first = 0
-        for row, basis, noise in zip(rows, self.bases, self._row_noise, strict=False):
-            values = (row if basis is None else basis.project(row)) / noise
+        for row, samples in enumerate(rows):
+            values = self._enter_row(row, samples)
             entries[first : first + values.size] = values
             first += values.size
         return entries / self.entry_weight
 
+    def _enter_consistency(self, row: int, residual: ConsistencyResidual) -> ConsistencyEntries:
+        """Return the entries of the row of a consistency residual."""
+        values = self._enter_row(row, residual.values[self._row_samples[row]])
+        slope = residual.acc_sensitivity * self._constant_entries[row]
+        return ConsistencyEntries(residual.body, values, slope)
+
+    @cached_property
+    def _constant_entries(self) -> tuple[Float1D, ...]:
+        """Entries of each row of which every sample is 1, (entry,)."""
+        return tuple(
+            self._enter_row(row, np.ones(samples.size))
+            for row, samples in enumerate(self._row_samples)
+        )
+
     def _correct_consistency(
-        self, consistency: ConsistencyResidual, parameters: ParameterSet
+        self, consistency: ConsistencyEntries, parameters: ParameterSet
     ) -> Float1D:
-        """Return a consistency residual less the tare errors of the accelerometers, (sample,)."""
+        """Return a consistency residual less the tare errors of the accelerometers, (entry,)."""
         signs = {"mass": (1, 0), "table": (0, 1), "mass against table": (1, -1)}
         mass, table = signs.get(consistency.body, (0, 0))
         zero_error = mass * parameters.tare_error(
             self.log_number, "acc"
         ) + table * parameters.tare_error(self.log_number, "table")
-        return (
-            consistency.values - consistency.acc_sensitivity * zero_error
-            if zero_error
-            else consistency.values
-        )
+        return consistency.values - zero_error * consistency.slope
 
     def _pull_rows(
         self, sampled: SampledMotion, parameters: ParameterSet, errors: Sequence[Float1D]

@@ -524,7 +524,8 @@ def build_signals(
     at_rest = _find_rest(block)
     good = np.logical_and.reduce([np.isfinite(values) for values in columns.values()])
     grid = FrequencyGrid(len(block), block.rate_hz)
-    usable = exclude_margins(good, round(LOST_MARGIN_S * block.rate_hz))
+    lost_margin = round(LOST_MARGIN_S * block.rate_hz)
+    usable = exclude_margins(good, lost_margin, lost_margin)
     margin = round(OPEN_END_S * block.rate_hz)
     # also where the drive rests: the mass may not yet
     usable[:margin], usable[-margin:] = False, False
