@@ -23,11 +23,12 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from table_io.block import Float1D, Float2D, Int1D
 from twin.discovery.candidates import Candidate
 from twin.discovery.least_squares import INTERVAL_SIGMA, MapFunction, compute_slopes
-from twin.discovery.parameters import FreeParameter, ParameterSet
+from twin.discovery.parameters import FreeParameter, ParameterKey, ParameterSet
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.strangers import compute_stranger_forces
 from twin.discovery.units import assign_units
@@ -217,11 +218,9 @@ class LinearEvidence:
         return sorted((*states, *with_stranger), key=lambda state: -state.log_evidence)
 
     def _is_separate(self, columns: Sequence[int], column: int) -> bool:
-        """Return True if the candidates share no parameter."""
-        own = {free.key for free in self.variants[column].candidate.free}
-        return all(
-            own.isdisjoint(free.key for free in self.variants[c].candidate.free) for c in columns
-        )
+        """Return True if the candidates share no parameter, and no coefficient of the solver."""
+        own = _list_keys(self.variants[column].candidate)
+        return all(own.isdisjoint(_list_keys(self.variants[c].candidate)) for c in columns)
 
     def _shape_count(self, columns: Sequence[int]) -> float:
         return sum(math.log(len(self.variants[c].candidate.shapes)) for c in columns)
@@ -248,6 +247,11 @@ class LinearEvidence:
         for state in states:
             best.setdefault((self.names(state), state.place), state)
         return [*best.values()]
+
+
+def _list_keys(candidate: Candidate) -> set[ParameterKey | str]:
+    """Return the parameters of a candidate and the coefficients by which the solver knows it."""
+    return {*(free.key for free in candidate.free), *candidate.effect.compiled}
 
 
 def build_evidence(
@@ -365,7 +369,8 @@ def _absorb_base(
     columns = columns / np.maximum(scale, 1e-300)[:, None]
     sizes = np.outer(scale, scale)
     noise = np.divide(noise, sizes, out=np.zeros_like(noise), where=sizes > 0)
-    gram = columns @ columns.T - noise
+    raw = columns @ columns.T
+    gram = raw - noise
     u, s, _ = np.linalg.svd(gram[:base, :base], hermitian=True)
     kept = s > MIN_BASE_SHARE * max(float(s.max(initial=0.0)), 1e-300)
     inverse = (u[:, kept] / s[kept]) @ u[:, kept].T
@@ -378,13 +383,14 @@ def _absorb_base(
     # columns that are noise, or that the base imitates, have nothing left
     is_left = np.diag(reduced)[:-1] > MIN_INFORMATION_SHARE
     products[~is_left], products[:, ~is_left], scores[~is_left] = 0.0, 0.0, 0.0
-    inflation, level = _measure_inflation(
-        rest[:-1] * is_left[:, None], rest[-1], unit, count, rich, expected
-    )
+    rest[:-1] *= is_left[:, None]
     usable = np.where(is_left, own_scale, 0.0)
-    own = rest[:-1] * np.where(is_left, own_scale, 0.0)[:, None]
-    chance = _absorb(noise, absorbed, base)[:-1, :-1] * np.outer(own_scale, own_scale)
-    covariance = inflation * (own @ own.T + np.where(np.outer(is_left, is_left), chance, 0.0))
+    kept_share = np.append(is_left, True)
+    raw, chance = (
+        _absorb(of, absorbed, base) * np.outer(kept_share, kept_share) for of in (raw, noise)
+    )
+    inflation, level = _measure_inflation(rest, raw, unit, count, rich, expected)
+    covariance = inflation * (raw + chance)[:-1, :-1] * np.outer(own_scale, own_scale)
     covariance += np.diag(np.where(is_left, MIN_INFORMATION_SHARE * own_scale**2, 1.0))
     places = {
         place: columns_of[is_left[columns_of]]
@@ -412,40 +418,38 @@ def _make_positive(products: Float2D) -> Float2D:
 
 
 def _measure_inflation(
-    rest: Float2D, r: Float1D, unit: Int1D, count: int, rich: Sequence[int], expected: Float1D
-) -> tuple[float, float]:
+    rest: Float2D, products: Float2D, unit: Int1D, count: int, rich: Sequence[int],
+    expected: Float1D,
+) -> tuple[float, float]:  # fmt: skip
     """Return (variance inflation of scores, level) of what the richest model leaves.
 
     That model has the stranger at every place, the columns `rich`, and the candidates that explain
     most beside them, because no smooth force has the jump of a friction: what is left scatters
-    between the units (steps) more than its samples say where these are correlated.
+    between the units (steps) more than its samples say where these are correlated. `rest` are the
+    `count` candidates, the stranger and the residual, (column, entry), `products` those of its
+    rows.
     """
-    chosen = [*rich, *range(count, len(rest))]
-    for _ in range(RICHEST_EFFECTS + 1):
-        basis = rest[chosen]
-        gram = basis @ basis.T
-        solution = np.linalg.lstsq(gram, basis @ np.column_stack([r, rest[:count].T]), rcond=1e-8)[
-            0
-        ]
-        left = r - solution[:, 0] @ basis
-        others = rest[:count] - solution[:, 1:].T @ basis
-        square = np.einsum("ij,ij->i", others, others)
-        gain = np.where(square > MIN_INFORMATION_SHARE, (others @ left) ** 2, 0.0)
+    chosen = [*rich, *range(count, len(rest) - 1)]
+    for added in range(RICHEST_EFFECTS + 1):
+        known = products[chosen]
+        solution = np.linalg.lstsq(known[:, chosen], known, rcond=1e-8)[0]
+        if added == RICHEST_EFFECTS:
+            break
+        unexplained = products[:count, -1] - known[:, :count].T @ solution[:, -1]
+        square = np.diag(products)[:count] - (known * solution).sum(axis=0)[:count]
+        gain = np.where(square > MIN_INFORMATION_SHARE, unexplained**2, 0.0)
         chosen += np.argsort(-gain / np.maximum(square, MIN_INFORMATION_SHARE))[:1].tolist()
+    left = rest[-1] - solution[:, -1] @ rest[chosen]
     level = float(np.mean(left**2 / expected))
-    ratios = []
-    units = int(unit.max(initial=0)) + 1
-    for column in rest[:count]:
-        square = column**2
-        if not square.any():
-            continue
-        own = np.bincount(unit, weights=square, minlength=units)
-        sums = np.bincount(unit, weights=column * left, minlength=units)
-        sums -= own * sums.sum() / own.sum()
-        effective = own.sum() ** 2 / (own @ own)
-        scatter = float(sums @ sums) * effective / max(effective - 1.0, 1.0)
-        ratios.append(scatter / max(float(square @ left**2), 1e-300))
-    correlated = float(np.median(ratios)) if ratios else 1.0
+    columns = rest[:count][rest[:count].any(axis=1)]
+    by_unit = csr_array((np.ones(unit.size), (unit, np.arange(unit.size))))
+    own, sums = by_unit @ (columns**2).T, by_unit @ (columns * left).T
+    whole = own.sum(axis=0)
+    sums -= own * sums.sum(axis=0) / whole
+    effective = whole**2 / (own**2).sum(axis=0)
+    scatter = (sums**2).sum(axis=0) * effective / np.maximum(effective - 1.0, 1.0)
+    ratios = scatter / np.maximum(columns**2 @ left**2, 1e-300)
+    correlated = float(np.median(ratios)) if ratios.size else 1.0
     return max(1.0, correlated) * max(1.0, level), level
 
 
