@@ -1,5 +1,6 @@
 """Evidence of sets of effects, in linear problems of known noise."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,8 +11,10 @@ from tests.discovery.played import prepare_bare_log
 from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
 from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, Variant, build_evidence
+from twin.discovery.law_terms import make_law_candidate
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
+from twin.laws.terms import FAMILIES
 
 ENTRIES, FORCE = 400, 100.0
 
@@ -45,6 +48,21 @@ def test_the_evidence_of_a_column_is_that_of_the_closed_form() -> None:
     _, logdet = np.linalg.slogdet(covariance)
     expected = 0.5 * (r @ r - r @ np.linalg.solve(covariance, r)) - 0.5 * logdet
     assert build(np.array([x]), r).measure_set([0]) == pytest.approx(expected)
+
+
+def test_no_set_has_two_laws_of_one_form_of_the_solver() -> None:
+    """Their coefficients would be added: a relaxation time is no sum of two."""
+    problem = prepare_bare_log().problem
+    family = next(each for each in FAMILIES if each.name == "bumper_relaxation")
+    laws = [each for each in problem.library if each.name in ("bumper_maxwell", "hunt_crossley")]
+    laws.append(make_law_candidate(family, problem.log_residuals[0].scale))
+    linear = build(draw(3, 5), draw(1, 6)[0])
+    linear = replace(linear, variants=tuple(Variant(law, (), 0) for law in laws))
+    pairs = [linear.names(state) for state in linear.rank_states(3) if len(state.columns) > 1]
+    assert {*pairs} == {
+        frozenset(("bumper_maxwell", "hunt_crossley")),
+        frozenset(("law_bumper_relaxation", "hunt_crossley")),
+    }
 
 
 def test_a_planted_amplitude_is_found_within_its_deviation() -> None:

@@ -2,6 +2,7 @@
 
 import ast
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from tests.recovery.recordings import log_columns, oscillator
 from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
 from twin.discovery.discover import discover_effects, prepare_problem
-from twin.discovery.law_search import propose_law, search_laws, select_law
-from twin.discovery.law_terms import LAW_PREFIX, list_law_candidates
+from twin.discovery.law_search import list_new_terms, propose_law, search_laws, select_law
+from twin.discovery.law_terms import LAW_PREFIX, list_law_candidates, make_law_candidate
 from twin.discovery.motion import RecordScale
-from twin.discovery.parameters import EffectKey
+from twin.discovery.parameters import EffectKey, ParameterSet
 from twin.discovery.symbolic_regression import make_term
 from twin.laws.effect_file import format_effect_file
 from twin.laws.expression import parse_unit
@@ -45,6 +46,28 @@ class TestTerms:
         )  # fmt: skip
         candidates = list_law_candidates(scale, has_contact=True)
         assert len(candidates) == len(FAMILIES)
+
+    @pytest.mark.parametrize("family", [each for each in FAMILIES if each.compiled])
+    def test_the_solvers_own_form_of_a_law_has_the_forces_of_its_expression(self, family):
+        problem = prepare_bare_log().problem
+        (residuals,), start = problem.log_residuals, prepare_bare_log().parameters
+        law = make_law_candidate(family, residuals.scale)
+        written = replace(law, effect=replace(law.effect, compiled={}))
+        size, shape = law.amplitude.scale, law.shapes[len(law.shapes) // 2]
+        none, fast, slow = (
+            residuals.evaluate(each.add_to(start, shape, amplitude))
+            for each, amplitude in ((law, 0.0), (law, size), (written, size))
+        )
+        assert np.linalg.norm(fast - none) > 100.0
+        assert np.linalg.norm(fast - slow) < 0.01 * np.linalg.norm(fast - none)
+
+    def test_a_law_that_the_model_has_in_the_solvers_form_is_offered_no_more(self):
+        problem = prepare_bare_log().problem
+        model = SNM.with_effect("bumper_maxwell", kb=1e5, tau=0.05)
+        fit = problem.fit_effects(ParameterSet.from_model(model, 1), ())
+        offered = [term.name for term in list_new_terms(problem, fit)]
+        assert "law_bumper_relaxation" not in offered
+        assert {"law_relaxation", "law_bumper_power"} <= {*offered}
 
     def test_laws_of_bumpers_need_contact(self):
         scale = prepare_bare_log().problem.log_residuals[0].scale

@@ -125,20 +125,26 @@ def search_laws(
 
     Beside them the effects of `best` may stay, or some of them.
     """
-    # without load cells contact is unknown, not absent
-    has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
-    known = [str(key) for key in null.fit.parameters.values]
-    terms = [
-        term
-        for term in list_law_candidates(problem.log_residuals[0].scale, has_contact)
-        if not any(name.startswith(f"{term.name}.") for name in known)  # of the model already
-    ]
+    terms = list_new_terms(problem, null)
     fitted_sets = _search_from(problem, null, (*best.effects, *terms), report)
     if not any(map(problem.leaves_noise, fitted_sets[:1])):
         expressions = list_symbolic_candidates(problem.log_residuals, null.fit.parameters)
         if expressions:
             fitted_sets += _search_from(problem, null, (*best.effects, *expressions), report)
     return sorted(fitted_sets, key=lambda fitted: fitted.cost)
+
+
+def list_new_terms(problem: SelectionProblem, null: FittedSet) -> list[Candidate]:
+    """Return the terms of laws that logs may show and that a model does not have already."""
+    # without load cells contact is unknown, not absent
+    has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
+    model = null.fit.parameters.to_model()
+    known = {instance.effect.id for instance in model.effects}.union(model.coefficients)
+    return [
+        term
+        for term in list_law_candidates(problem.log_residuals[0].scale, has_contact)
+        if known.isdisjoint((term.name, *term.effect.compiled))
+    ]
 
 
 def _search_from(

@@ -105,7 +105,8 @@ def make_law_candidate(family: ForceTerm, scale: RecordScale) -> Candidate:
         valid_range=list_valid_range(family.place, scale),
         is_of_file=True,
     )
-    return make_candidate(law, used, ladders, scale)
+    candidate = make_candidate(law, used, ladders, scale)
+    return replace(candidate, effect=replace(law, compiled=family.compiled))
 
 
 def list_references(scale: RecordScale, texts: Sequence[str]) -> dict[str, float]:

@@ -21,7 +21,8 @@ class ForceTerm:
 
     `shapes` gives a ladder by name; a shape in m, m/s or s is relative to the record's largest
     displacement (depth in a bumper), velocity or the duration. `power` is (variable, is odd) of a
-    power law; `amplitude` the name and unit of the parameter with which the law vanishes.
+    power law; `amplitude` the name and unit of the parameter with which the law vanishes;
+    `compiled` the solver's own form, as of an effect of the library, for a search: it is faster.
     """
 
     name: str
@@ -33,6 +34,7 @@ class ForceTerm:
     states: Mapping[str, State] = field(default_factory=dict)
     title: str = ""
     amplitude: tuple[str, str] = ("k", "N")
+    compiled: Mapping[str, str] = field(default_factory=dict)
 
 
 REFERENCE_UNITS = {"u0": "m", "v0": "m/s", "d0": "m", "y0": "m", "t0": "s"}
@@ -145,7 +147,7 @@ FAMILIES: tuple[ForceTerm, ...] = (
                title="bumper stiffness that changes with the time since touch"),
     ForceTerm("bumper_relaxation", CONTACT, "bumpers", "f", {"tau": RELAXATIONS},
                states={"f": State("N", "k * v / d0 - f / tau")},
-               title="bumper that relaxes"),
+               title="bumper that relaxes", compiled={"kb": "k / d0", "rate_b": "1 / tau"}),
     ForceTerm("table_power", TABLE, "input", f"g * {write_power('y', 'y0', True)}",
                {"p": (1.0, 2.0, 3.0)}, ("y", True), title="force of the table's position",
                amplitude=("g", "m/s2")),
@@ -178,7 +180,8 @@ FAMILIES: tuple[ForceTerm, ...] = (
                {"p": (2.0, 4.0), "n": (1.0, 4.0), "w": YIELD_LENGTHS},
                states=HYSTERESIS, title="hysteresis behind slack"),
     ForceTerm("relaxation", MEMORY, "damper", "f", {"tau": RELAXATIONS},
-               states={"f": State("N", "k * v / u0 - f / tau")}, title="relaxation"),
+               states={"f": State("N", "k * v / u0 - f / tau")}, title="relaxation",
+               compiled={"k1": "k / u0", "rate_1": "1 / tau"}),
     ForceTerm("nonlinear_relaxation", MEMORY, "damper", "k * (e / u0)**3",
                {"b": (0.03, 0.1, 0.3, 1.0)},
                states={"e": State("m", "v - b * (e / u0)**3")},
