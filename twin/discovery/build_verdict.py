@@ -238,7 +238,7 @@ def _check_discovery_sensors(discovery: Discovery) -> tuple[SensorCheck, ...]:
     """Return the checks of the instruments, and the sensor errors that the verdict names."""
     best, verdict = discovery.verdict.best, discovery.verdict
     log_residuals = discovery.prepared.problem.log_residuals
-    checks = check_sensors(log_residuals, best.fit)
+    checks = check_sensors(log_residuals, best.fit, not verdict.has_remainder)
     if verdict.outcome != "named":
         return checks
     logs = ", ".join(residuals.signals.name for residuals in log_residuals)

@@ -20,7 +20,6 @@ from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
 from twin.discovery.units import assign_folds
 
 MAX_EFFECTS = 3
-MAX_EXPLAINED_COST = 1.1  # mean square over the noise: with less, nothing is left to explain
 MAX_ROUNDS = 3  # of rankings, each about the best fit of the one before
 REFIT_NATS, MAX_REFITS = 5.0, 4  # below the best log evidence; sets refitted in a round
 MIN_PROBABILITY = 1e-3  # of an explanation that is reported
@@ -165,6 +164,11 @@ class SelectionProblem:
     def leaves_noise(self, fitted: FittedSet) -> bool:
         """Return True if what a set leaves of the forces is noise, its own included."""
         return self.measure_level(fitted) <= MAX_LEVEL * max(1.0, self.measure_noise(fitted))
+
+    def is_explained_by(self, fit: FitResult) -> bool:
+        """Return True if a fit leaves no more than noise of the forces, on the data fitted."""
+        entries = [each.evaluate(fit.parameters) for each in self.log_residuals]
+        return measure_level(self.log_residuals, entries, forces_only=True) <= MAX_LEVEL
 
     def mean_squares(self, fitted: FittedSet) -> dict[str, float]:
         """Return the mean square of the cross-validation residual by row; without small rows."""

@@ -1,8 +1,8 @@
 """Checks of the instruments, apart from any force law: healthy, or to be mended.
 
 Noise is judged on the record at rest. A laser and an accelerometer on one body are compared with
-each other, as are the two load cells of a side with their sum. What errors explain the recordings
-together with the model is added from the fit: lags of all channels, and gaps read wrongly.
+each other, as are the two load cells of a side with their sum. Where errors explain the recordings
+together with the model, they are added from the fit: gaps read wrongly, and resonances.
 """
 
 import math
@@ -19,7 +19,6 @@ from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
 from twin.discovery.nuisances import list_sizes
 from twin.discovery.parameters import GapKey, NuisanceKey
 from twin.discovery.residuals import LogResiduals
-from twin.discovery.selection import MAX_EXPLAINED_COST
 from twin.discovery.signals import CELL_PAIRS, OPEN_END_S, SENSOR_PAIRS, LogSignals
 
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
@@ -79,15 +78,20 @@ class SensorCheck:
         return bool(is_small or self.low < 0 < self.high)
 
 
-def check_sensors(log_residuals: Sequence[LogResiduals], fit: FitResult) -> tuple[SensorCheck, ...]:
-    """Return all checks of the instruments of logs, with the parameters of a fit to them."""
+def check_sensors(
+    log_residuals: Sequence[LogResiduals], fit: FitResult, is_explained: bool
+) -> tuple[SensorCheck, ...]:
+    """Return all checks of the instruments of logs, with the parameters of a fit to them.
+
+    Unless the fit leaves noise alone, its errors of instruments may be what the model lacks.
+    """
     checks: list[SensorCheck] = []
     for residuals in log_residuals:
         signals = residuals.signals if residuals.nuisances is None else residuals.nuisances.raw
         checks += _check_noise(signals)
         checks += compare_sensors(signals)
         checks += _check_cells(signals)
-        if fit.cost <= MAX_EXPLAINED_COST * residuals.sensor_square:
+        if is_explained:
             checks += _check_fitted(residuals, fit)
     return tuple(checks)
 

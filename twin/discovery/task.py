@@ -370,7 +370,9 @@ def build_report(
             )
             if pair
         ],
-        sensors=build_sensors(check_sensors(log_residuals, fit)),
+        sensors=build_sensors(
+            check_sensors(log_residuals, fit, result.problem.is_explained_by(fit))
+        ),
         warnings=[*result.warnings],
         notes=[*notes],
         start=start,
