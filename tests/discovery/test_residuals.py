@@ -53,6 +53,7 @@ def test_residuals_do_not_depend_on_what_was_evaluated_before() -> None:
     pair = (prepared.signals, prepared.contact_n)
     (residuals,) = build_log_residuals([pair], SNM)
     start = ParameterSet.from_model(SNM, 1)
+    others: list[dict[ParameterKey, float]] = [{STIFFNESS: 1e3 * k} for k in range(50, 60)]
     changes: list[dict[ParameterKey, float]] = [
         {},
         {STIFFNESS: 4e4},
@@ -61,7 +62,7 @@ def test_residuals_do_not_depend_on_what_was_evaluated_before() -> None:
         {TareKey(0, "acc"): 0.01, EffectKey("bouc_wen", "force"): 50.0,
          EffectKey("bouc_wen", "yield_displacement"): 1e-3},
         {GapKey(0): 2e-4},
-        *({STIFFNESS: 1e3 * k} for k in range(50, 60)),
+        *others,
         {},
     ]  # fmt: skip
     results = []

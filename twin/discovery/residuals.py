@@ -234,8 +234,8 @@ class LogResiduals:
                 1:
             ]
             contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
-        change = np.abs(np.diff(contact, axis=1, prepend=contact[:, :1])).any(axis=0)
-        smooth = exclude_margins(~change, margin, margin)
+        is_steady = (np.diff(contact, axis=1, prepend=contact[:, :1]) == 0).all(axis=0)
+        smooth = exclude_margins(is_steady, margin, margin)
         if contact is not self.contact_state:
             used[0] &= smooth
         for row, name in enumerate(self.rows):
