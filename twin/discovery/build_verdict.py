@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import Discovery, PreparedLog
 from twin.discovery.held_out import compute_force_error
-from twin.discovery.hidden_effects import bound_effects, find_largest
+from twin.discovery.hidden_effects import bound_effects
 from twin.discovery.law_search import LawProposal
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
 from twin.discovery.nuisances import list_sizes
@@ -186,7 +186,7 @@ def _list_excluded(discovery: Discovery) -> list[ExcludedSet]:
 def _list_excluded_sizes(discovery: Discovery) -> list[ExcludedSize]:
     """Return the largest size of each effect that is not in the best set."""
     effects = bound_effects(discovery.selection.evidence, discovery.verdict.best)
-    largest = sorted(map(find_largest, effects), key=lambda effect: effect.share)
+    largest = sorted((forms[-1] for forms in effects), key=lambda effect: effect.share)
     return [
         ExcludedSize(
             id=effect.candidate.name,

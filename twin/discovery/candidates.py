@@ -11,7 +11,6 @@ from itertools import product
 
 import numpy as np
 
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import (
     SLIP_SPEED,
@@ -127,10 +126,6 @@ def _exclusion_reason(effect: Effect, has_contact: bool, channels: set[str]) -> 
     missing = [name for name in effect.required_channels if name not in channels]
     if missing:
         return f"needs {', '.join(missing)}"
-    if effect.id == "mass_error":
-        cells = channels & {*RIGHT_CELLS, *LEFT_CELLS}
-        if "damper_force_n" in channels or not (cells and has_contact):
-            return "needs measured bumper forces in addition to the acceleration of the mass"
     return ""
 
 

@@ -27,7 +27,6 @@ from twin.discovery.nuisances import (
 from twin.discovery.parameters import (
     INPUT_GAIN,
     INPUT_OFFSET,
-    FreeParameter,
     GapKey,
     NuisanceKey,
     ParameterSet,
@@ -296,12 +295,11 @@ def discover_effects(
 def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedProblem:
     """Return the problem with nuisances, and noise, about a model with effects."""
     problem, parameters = prepared.problem, fitted.fit.parameters
-    free = parameters.free
     log_residuals = tuple(
         linearize_nuisances(replace(residuals, noise_scale={}), parameters, mapper=problem.mapper)
         for residuals in problem.log_residuals
     )
-    own = [free_parameter for free_parameter in free if not _is_nuisance(free_parameter)]
+    own = [free for free in parameters.free if not isinstance(free.key, NuisanceKey)]
     start = _start_nuisances(log_residuals, parameters.with_free(own))
     fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
     base = fitted.remove_from(fit.parameters)
@@ -312,10 +310,6 @@ def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedPr
         log_residuals, fitted.remove_from(fit.parameters), mapper=problem.mapper
     )
     return replace(prepared, problem=replace(problem, log_residuals=log_residuals), first_fit=first)
-
-
-def _is_nuisance(free: FreeParameter) -> bool:
-    return isinstance(free.key, NuisanceKey)
 
 
 def _judge(

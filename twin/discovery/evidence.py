@@ -98,16 +98,9 @@ class LinearEvidence:
             return self._measure(chosen, self._precision[chosen])
         extra = self.places[place]
         both = [*chosen, *extra.tolist()]
+        precision, is_extra = self._precision[both], np.arange(len(both)) >= len(chosen)
         evidences = [
-            self._measure(
-                both,
-                np.concatenate(
-                    [
-                        self._precision[chosen],
-                        self._precision[extra] * (EFFECT_SHARE / share) ** 2,
-                    ]
-                ),
-            )
+            self._measure(both, np.where(is_extra, (EFFECT_SHARE / share) ** 2, 1.0) * precision)
             for share in STRANGER_SHARES
         ]
         return float(np.logaddexp.reduce(evidences)) - math.log(len(evidences))

@@ -45,7 +45,10 @@ class UndetectedEffect:
 
 
 def bound_effects(linear: LinearEvidence | None, best: FittedSet) -> list[list[UndetectedEffect]]:
-    """Return each effect that is not in a set, in all its forms; `linear` is about that set."""
+    """Return each effect that is not in a set in all its forms, the one that shows best first.
+
+    `linear` is about that set.
+    """
     if linear is None:
         return []
     kept = [linear.find_column(effect, best.find_shape(effect)) for effect in best.effects]
@@ -58,24 +61,14 @@ def bound_effects(linear: LinearEvidence | None, best: FittedSet) -> list[list[U
         forms.setdefault(variant.candidate.name, []).append(
             UndetectedEffect(variant.candidate, variant.shape, end, share)
         )
-    return [*forms.values()]
-
-
-def find_largest(forms: list[UndetectedEffect]) -> UndetectedEffect:
-    """Return the form of an effect that the recordings show worst."""
-    return max(forms, key=lambda form: form.share)
-
-
-def find_clearest(forms: list[UndetectedEffect]) -> UndetectedEffect:
-    """Return the form of an effect that the recordings show best."""
-    return min(forms, key=lambda form: form.share)
+    return [sorted(each, key=lambda form: form.share) for each in forms.values()]
 
 
 def find_hidden_effects(
     linear: LinearEvidence | None, best: FittedSet
 ) -> tuple[UndetectedEffect, ...]:
     """Return each further force law as large as the noise may hide it, where it is not blind."""
-    clearest = [find_clearest(forms) for forms in bound_effects(linear, best)]
+    clearest = [forms[0] for forms in bound_effects(linear, best)]
     return tuple(
         each for each in clearest if math.isfinite(each.share) and not each.candidate.channel
     )
@@ -88,7 +81,7 @@ def find_blind_spots(
 
     Each as large as `MAX_HIDDEN_SHARE` of the record, in the form that the recordings show best.
     """
-    clearest = [find_clearest(forms) for forms in bound_effects(linear, best)]
+    clearest = [forms[0] for forms in bound_effects(linear, best)]
     return tuple(
         each.limit(MAX_HIDDEN_SHARE)
         for each in clearest

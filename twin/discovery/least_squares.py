@@ -234,9 +234,6 @@ class _LevenbergMarquardt:
         parameters = self.start.with_vector(x)
         return [residuals.evaluate(parameters) for residuals in self.log_residuals]
 
-    def select_training(self, entries: Sequence[Float1D]) -> Float1D:
-        return select_entries(entries, self.train)
-
     def fill_jacobian(self, jacobian: Float2D, x: Float1D, current: list[Float1D]) -> None:
         parameters = self.start.with_vector(x)
         fill_jacobian(self.log_residuals, parameters, current, self.train, self.mapper, jacobian)
@@ -252,7 +249,7 @@ class _LevenbergMarquardt:
     def run(self, without_noise: bool) -> FitResult:
         x = np.clip(self.start.to_vector(), self.low, self.high)
         current = self.evaluate(x)
-        r = self.select_training(current)
+        r = select_entries(current, self.train)
         cost, damping, converged = float(r @ r), 1e-4, not self.free
         jacobian = np.empty((x.size, r.size))
         self.fill_jacobian(jacobian, x, current)
@@ -264,7 +261,7 @@ class _LevenbergMarquardt:
                 if np.array_equal(trial_x, x):
                     break
                 trial_values = self.evaluate(trial_x)
-                trial_chosen = self.select_training(trial_values)
+                trial_chosen = select_entries(trial_values, self.train)
                 trial_cost = float(trial_chosen @ trial_chosen)
                 if trial_cost < cost:
                     gain = (cost - trial_cost) / max(cost, 1e-300)
@@ -288,13 +285,13 @@ class _LevenbergMarquardt:
         It is a step of the linear model: shorter where the residuals do not follow that.
         """
         self.noise = noise = self._measure_noise(x, current, jacobian)
-        r = self.select_training(current)
+        r = select_entries(current, self.train)
         hessian = noise.take_off(jacobian @ jacobian.T)
         gradient = jacobian @ r - noise.with_residual
         for damping in HELD_OUT_DAMPINGS:
             trial_x = self.take_step(x, hessian, gradient, damping)
             trial = self.evaluate(trial_x)
-            if _is_linear(r, (trial_x - x) @ jacobian, self.select_training(trial)):
+            if _is_linear(r, (trial_x - x) @ jacobian, select_entries(trial, self.train)):
                 self.fill_jacobian(jacobian, trial_x, trial)
                 return trial_x, trial
         return x, current
@@ -309,7 +306,7 @@ class _LevenbergMarquardt:
         slopes = np.empty_like(jacobian)
         fill_jacobian(copies, parameters, noisy_values, self.train, self.mapper, slopes)
         slopes -= jacobian
-        r = self.select_training(noisy_values) - self.select_training(current)
+        r = select_entries(noisy_values, self.train) - select_entries(current, self.train)
         products = _limit_noise(slopes @ slopes.T, jacobian @ jacobian.T)
         return _NoiseProducts(x, products, slopes @ r)
 
@@ -322,7 +319,7 @@ class _LevenbergMarquardt:
         hessian = self.noise.take_off(products) if self.noise else products
         # parameters at a bound are fixed there
         inverse, is_open = _invert_information(hessian, (self.low < x) & (x < self.high))
-        r = self.select_training(current)
+        r = select_entries(current, self.train)
         cost = float(r @ r)
         first, count = 0, 0
         scatter, rest_scatter = np.zeros_like(inverse), np.zeros_like(inverse)

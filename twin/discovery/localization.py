@@ -154,7 +154,7 @@ def find_pulling_bumpers(
                 side = name.split()[0]
                 messages.append(
                     f"{residuals.signals.name}: the {side} bumper pulls after release, as if it "
-                    "adhered to the mass; no effect of the library does this"
+                    "adhered to the mass: no law in compression alone does this"
                 )
     return tuple(messages)
 

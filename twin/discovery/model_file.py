@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from table_io.config.base import format_toml
 from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
 from twin.discovery.nuisances import MAX_SIZE, TYPICAL_GAIN
 from twin.discovery.parameters import INPUT_GAIN, BaseKey, EffectKey, GapKey, SlipKey
@@ -89,37 +90,31 @@ def format_model_toml(
     intervals: Mapping[str, tuple[float, float]],
     files: Mapping[str, str] | None = None,
 ) -> str:
-    """Return the text of a model file: `texts` by key, those that are empty left out.
+    """Return the text of a model file: `texts` by key, without an empty `provisional`.
 
-    `effects` are values by (effect, channel), `intervals` by parameter, `files` the names of the
-    effect files by effect.
+    `effects` are values by (effect, channel), `intervals` of 95 % by parameter, `files` the names
+    of the effect files by effect.
     """
-    sources = {effect: f"file = {_quote_toml(name)}" for effect, name in (files or {}).items()}
-    lines = [
-        f"{key} = {_quote_toml(text)}"
-        for key, text in texts.items()
-        if text or key != "provisional"
+    sources = {effect: {"file": name} for effect, name in (files or {}).items()}
+    rows = [
+        {
+            **sources.get(effect, {"id": effect}),
+            "parameters": {**values, **({"channel": channel} if channel else {})},
+        }
+        for (effect, channel), values in effects.items()
     ]
-    lines += [
-        "[base]",
-        f"stiffness_n_m = {base.stiffness!r}",
-        f"damping_n_s_m = {base.damping!r}",
-        f"bumper_stiffness_n_m = {base.bumper_stiffness_r!r}",
-        f"bumper_damping_n_s_m = {base.bumper_damping_r!r}",
-    ]
-    for (effect, channel), values in effects.items():
-        numbers = [f"{name} = {value!r}" for name, value in values.items()]
-        numbers += [f"channel = {_quote_toml(channel)}"] if channel else []
-        lines += [
-            "[[effects]]",
-            sources.get(effect, f"id = {_quote_toml(effect)}"),
-            f"parameters = {{ {', '.join(numbers)} }}",
-        ]
-    lines += ["[intervals]  # 95 %"]
-    lines += [
-        f"{_quote_toml(name)} = [{low!r}, {high!r}]" for name, (low, high) in intervals.items()
-    ]
-    return "\n".join(lines) + "\n"
+    content = {
+        **{key: text for key, text in texts.items() if text or key != "provisional"},
+        "base": {
+            "stiffness_n_m": base.stiffness,
+            "damping_n_s_m": base.damping,
+            "bumper_stiffness_n_m": base.bumper_stiffness_r,
+            "bumper_damping_n_s_m": base.bumper_damping_r,
+        },
+        **({"effects": rows} if rows else {}),
+        "intervals": dict(intervals),
+    }
+    return format_toml(content)
 
 
 def effect_file_name(effect: Effect) -> str:
@@ -138,8 +133,3 @@ def list_effect_files(fit: FitResult, laws: Sequence[Effect] = ()) -> dict[str, 
             isinstance(key, EffectKey) and key.effect == effect.id for key in fit.parameters.values
         )
     }
-
-
-def _quote_toml(text: str) -> str:
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
-    return f'"{escaped}"'

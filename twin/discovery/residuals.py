@@ -326,11 +326,6 @@ class LogResiduals:
         return sampled
 
     @cached_property
-    def band_hz(self) -> float:
-        """Highest frequency of the facts in Hz: above it the measured forces are noise."""
-        return self.signals.band_hz
-
-    @cached_property
     def bases(self) -> tuple[BlockBasis | None, ...]:
         """Components of each row; None for a row whose samples are its entries.
 
@@ -346,7 +341,7 @@ class LogResiduals:
             else BlockBasis(
                 _split_at_gaps(samples, block.get(name, self.sample_block)),
                 rate_hz,
-                band_hz := self.row_bands.get(name, self.band_hz),
+                band_hz := self.row_bands.get(name, self.signals.band_hz),
                 samples,
                 tuple(hz for hz in self.signals.hum_hz if hz < band_hz),
             )
@@ -455,13 +450,8 @@ class LogResiduals:
 
     def measured_forces(
         self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None = None
-    ) -> Float2D:
-        """Return (3, sample) in N: damper force from the force balance of the mass, F_R, -F_L."""
-        return np.array(self._measured_forces(m, mass_kg, parameters))
-
-    def _measured_forces(
-        self, m: MeasuredMotion, mass_kg: float, parameters: ParameterSet | None
     ) -> tuple[Float1D, Float1D, Float1D]:
+        """Return the damper force from the force balance of the mass, F_R, -F_L; (sample,), N."""
         zero_error = {
             channel: parameters.tare_error(self.log_number, channel) if parameters else 0.0
             for channel in TARED_CHANNELS
@@ -582,7 +572,7 @@ class LogResiduals:
         if added is not None:
             d = d + model.parameters.mass * added
         left = -left
-        measured = self._measured_forces(m, model.parameters.mass, parameters)
+        measured = self.measured_forces(m, model.parameters.mass, parameters)
         return measured[0] - d, measured[1] - right, measured[2] - left
 
     def _model_forces(
@@ -872,9 +862,8 @@ class LogResiduals:
 
         Their norm tells how large a force is beside the noise.
         """
-        return self._enter_rows(
-            np.nan_to_num(self.measured_forces(self.motion(), self.signals.mass_kg))
-        )
+        forces = np.array(self.measured_forces(self.motion(), self.signals.mass_kg))
+        return self._enter_rows(np.nan_to_num(forces))
 
     def _enter_rows(self, forces: Float2D) -> Float1D:
         """Return entries over the noise, (entry,), from forces of the three rows, (3, sample)."""

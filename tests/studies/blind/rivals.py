@@ -167,7 +167,8 @@ class RegressionProblem:
         noise = residuals.force_noise(m, mass)[rows] * residuals.entry_weight[entries]
         values = np.stack([*base, *columns.values()], axis=1)
         values = (values[samples] if by_sample else values) / noise[:, None]
-        force = residuals.measured_forces(m, mass, self.parameters)[rows, samples] / noise
+        forces = np.array(residuals.measured_forces(m, mass, self.parameters))
+        force = forces[rows, samples] / noise
         return ForceRegression(
             force, np.column_stack([values[:, : len(base)], 1.0 / noise]), tuple(columns),
             values[:, len(base) :], entries, assign_folds(residuals)[entries],
