@@ -108,7 +108,9 @@ def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> 
 SWING_HARMONICS = 30  # of u: an impact on a bumper takes a tenth of a cycle or more
 MIN_HARMONIC_SIGMA = 3.0  # standard errors below which a harmonic is noise
 SWING_PHASES = 720  # of a cycle, at which the extremes are looked for: 1e-5 of the swing
-MAX_UNREPEATED = 0.004  # of the swing: rms beyond the noise of what the harmonics leave
+# Rms beyond the noise of what the harmonics may leave, of the swing. At 0.004 the swing next to
+# bumpers is right within 1 um; single extremes of raw samples are worse than harmonics up to 0.02.
+MAX_LEFT, MAX_LEFT_OF_RAW = 0.004, 0.02
 NOISE_ERROR = 5.0  # over the root of the samples: three standard errors of the noise's mean square
 
 
@@ -118,14 +120,17 @@ def mean_swing(u: Float1D, phase: Float1D) -> float:
     Of the harmonics of the motion: extremes of single cycles are larger by the noise of the
     sensor. Where the cycles differ, the mean of their extremes.
     """
-    ends = find_steady_extremes(u, phase)
+    ends = find_steady_extremes(u, phase, MAX_LEFT_OF_RAW)
     return _mean_range(u, phase) if ends is None else 0.5 * (ends[0] - ends[1])
 
 
-def find_steady_extremes(u: Float1D, phase: Float1D) -> tuple[float, float] | None:
+def find_steady_extremes(
+    u: Float1D, phase: Float1D, max_left: float = MAX_LEFT
+) -> tuple[float, float] | None:
     """Return (max u, min u) in m of the harmonics of u, (sample,), over whole cycles of `phase`.
 
-    None if samples are lost, or where cycles or higher harmonics differ by more than the noise.
+    None if samples are lost, or where cycles that differ or higher harmonics leave more than the
+    noise and `max_left` of the swing.
     """
     fit = track_harmonics(u, phase, SWING_HARMONICS)
     if not math.isfinite(fit.residual_rms):
@@ -137,7 +142,7 @@ def find_steady_extremes(u: Float1D, phase: Float1D) -> tuple[float, float] | No
     high, low = fit.offset + float(motion.max()), fit.offset + float(motion.min())
     # White noise of unit rms has a third difference of rms sqrt(20); the motion itself has none.
     square = float(np.mean(np.diff(u, 3) ** 2)) / 20.0 * (1.0 + NOISE_ERROR / math.sqrt(u.size))
-    allowed = math.hypot(math.sqrt(square), 0.5 * MAX_UNREPEATED * (high - low))
+    allowed = math.hypot(math.sqrt(square), 0.5 * max_left * (high - low))
     return (high, low) if fit.residual_rms <= allowed else None
 
 

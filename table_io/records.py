@@ -373,7 +373,8 @@ class OrbitPoint:
 
     The orbit is that of the table without feedback only if the feedback has vanished: `accepted`
     means that its harmonics are at noise level or below the tolerance, and that the amplitude is
-    that of the sought branch; else `reason` says what is missing. `u_m` are the harmonics U_0,
+    that of the sought branch; else `reason` says what is missing. Of an accepted orbit amplitude
+    and `u_m` are without what the feedback left moves u by. `u_m` are the harmonics U_0,
     U_1, ... as Re U_0, Im U_0, Re U_1, ... with u(t) = Re sum U_k exp(i k phi), where the table's
     acceleration is a sin(phi). `feedback_m` are the amplitudes of harmonics 0, 1, ... of the
     correction, `noise_m` the standard error of their root sum of squares by the scatter between

@@ -280,11 +280,21 @@ def _bounded_jacobian(orbit: PlannedOrbit) -> Float2D:
     return bounded
 
 
+def find_feedback_motion(orbit: PlannedOrbit, measured: OrbitMeasurement) -> Float1D:
+    """Return the harmonics of u in m by which the feedback moves the mass, (2 H + 1,)."""
+    return _bounded_jacobian(orbit) @ _move_table(measured)
+
+
+def _move_table(measured: OrbitMeasurement) -> Float1D:
+    """Return the harmonics in m by which the feedback moves the table."""
+    return pack_harmonics(unpack_harmonics(measured.feedback) * measured.response)
+
+
 def _free_motion(
     orbit: PlannedOrbit, measured: OrbitMeasurement, table_change: Float1D | float
 ) -> Float1D:
     """Return the harmonics of x in m without the feedback, after a change of the table."""
-    table = pack_harmonics(unpack_harmonics(measured.feedback) * measured.response) - table_change
+    table = _move_table(measured) - table_change
     return measured.x - _bounded_jacobian(orbit) @ table - table
 
 

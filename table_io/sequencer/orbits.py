@@ -22,6 +22,7 @@ from table_io.adaptive.continuation import (
     OrbitMeasurement,
     OrbitTarget,
     correct_target,
+    find_feedback_motion,
     fundamental,
     is_on_branch,
     measure_phase,
@@ -45,6 +46,7 @@ from table_io.control.orbit_feedback import (
     FeedbackState,
     ReferenceSegment,
     advance_feedback,
+    evaluate_harmonics,
 )
 from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget, Trajectory
@@ -348,12 +350,16 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     reason = _find_fault(config, target, measured, command_m, noise_m, level_ratio)
     has_ended = not reason or target.update >= config.updates
     if has_ended:
+        # What feedback within its noise or tolerance moves u by is known to the first order.
+        moved = np.zeros_like(u) if reason else find_feedback_motion(orbit, measured)
+        u = u - moved
+        moved_m = evaluate_harmonics(moved, phase + lag_angle / math.tau)
         point = OrbitPoint(
             stage.last,
             target.position,
             target.frequency_hz,
             table.fundamental,
-            mean_swing(u_m, phase),
+            mean_swing(u_m - moved_m, phase),
             tuple(np.array([u[0], 0.0, *u[1:]]).tolist()),
             tuple(np.abs(unpack_harmonics(feedback)).tolist()),
             noise_m,

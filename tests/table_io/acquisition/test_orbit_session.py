@@ -108,7 +108,8 @@ def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
 def test_measured_orbits_are_those_of_the_plant(held: PlayedSession) -> None:
     for point in held.select(OrbitPoint):
         true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
-        assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=0.004)
+        # 3e-4 with what the feedback left moves u by
+        assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=2e-4)
         assert point.amplitude_m > math.hypot(*point.u_m[2:4])
 
 

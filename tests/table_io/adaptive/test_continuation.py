@@ -9,6 +9,7 @@ from table_io.adaptive.continuation import (
     MeasuredOrbit,
     OrbitMeasurement,
     correct_target,
+    find_feedback_motion,
     fundamental,
     is_on_branch,
     measure_phase,
@@ -70,6 +71,8 @@ def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
     target = plan_target(plan, 0, ())
     measured = hold(target.reference, u + table, jacobian, 0.5 - 0.3j)
     assert measured.feedback_m > 1e-5
+    moved = find_feedback_motion(plan.points[0], measured) + measured.feedback
+    np.testing.assert_allclose(measured.x - moved, u + table, atol=1e-12)
     target = correct_target(plan, target, measured)
     np.testing.assert_allclose(target.reference, u + table, atol=1e-12)
     assert target.frequency_hz == f
