@@ -14,7 +14,7 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
-from tests.builders.rigs import RIG_TEXT, read_model_text
+from tests.builders.rigs import RIG_TEXT, read_model_text, read_rig_text
 from tests.command_line import call_main
 from twin.rig.check import check_config, find_worst_rows, print_plan, select_rows, sum_durations_s
 from twin.rig.drive_figure import draw_drive
@@ -74,6 +74,15 @@ def test_the_plan_names_the_loop_check_the_buffer_and_the_room_that_is_left() ->
     assert row[-4:] == ["83", "%", "99", "%"]  # of the stroke, as it is and 20 % larger
     assert "no bumpers" in format_plan(read_shipped("ginf"))
     assert "loop check none" in format_plan(bundle(TEST + "[loop_check]\nenabled = false\n"))
+
+
+def test_the_plan_states_why_a_loop_check_is_played_at_more_than_a_tenth() -> None:
+    sticky, smooth = (
+        format_plan(bundle(TEST, read_rig_text("hydraulic"))),
+        format_plan(bundle(TEST)),
+    )
+    assert "not a tenth: below table_response.least_level_g = 0.05 friction" in sticky
+    assert "not a tenth" not in smooth
 
 
 def test_the_parts_of_a_test_are_its_duration() -> None:
