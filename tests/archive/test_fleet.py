@@ -169,6 +169,26 @@ def test_changes_since_an_earlier_fleet_are_listed(log_file: Path, tmp_path: Pat
 
 
 @pytest.mark.usefixtures("here")
+@pytest.mark.parametrize("task", ["replay", "prc"])
+def test_a_recording_that_was_cut_off_is_no_result_like_others(
+    log_file: Path, tmp_path: Path, task: Any
+) -> None:
+    whole = log_file.read_bytes()
+    for name, share in (("start", 0.02), ("half", 0.6), ("whole", 1.0)):
+        (tmp_path / "archive" / name).mkdir(parents=True)
+        size = round(share * len(whole))
+        (tmp_path / "archive" / name / "run.mcap").write_bytes(whole[:size])
+    fleet = run_fleet(FleetOptions(task, [tmp_path / "archive"], out=tmp_path / "out"))
+    rows = {Path(line.log).parent.name: line for line in fleet.results}
+    assert "no " in rows["start"].failure
+    assert not rows["half"].failure
+    key, cut, intact = {"replay": ("intact", False, True), "prc": ("ended", "halted", "complete")}[
+        task
+    ]
+    assert (rows["half"].values[key], rows["whole"].values[key]) == (cut, intact)
+
+
+@pytest.mark.usefixtures("here")
 def test_fleet_identifies_each_log_by_itself(log_file: Path, tmp_path: Path) -> None:
     """The model of a log is in a folder next to the table."""
     fitted = run_fleet(FleetOptions("identify", [log_file.parent], out=tmp_path / "identify"))

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from pathlib import Path
 
+from table_io.errors import InputError
 from twin.archive.run_row import Row
 from twin.inspection.curves import read_curves
 from twin.replay.command import tabulate_replay
@@ -31,7 +32,10 @@ def check_recording(log: Path, model: str | None, folder: Path) -> Row:
 def summarise_curves(log: Path, model: str | None, folder: Path) -> Row:
     """Return the largest response, jumps and hysteresis of a log, as `prc` prints them."""
     (run,) = read_curves(log).runs
+    if not run.steps:
+        raise InputError(f"no step was measured: {run.reason or run.verdict}", where=log)
     row: Row = {
+        "ended": run.verdict,
         "u_star_m": run.u_star_m,
         "a_star_m_s2": run.a_star_m_s2,
         "jumps": _format_jumps(run.jumps),
@@ -57,11 +61,16 @@ def _format_jumps(jumps: list[Jump]) -> str:
 def replay_log(log: Path, model: str | None, folder: Path) -> Row:
     """Return the errors of a replay with a model, by default the recorded one."""
     recorded = open_replay_log(log)
+    if not recorded.recording.contiguous_blocks("meas"):
+        raise InputError(
+            "no measured samples", where=log, remedy="`shaketwin verify` says what is lost"
+        )
     span = select_span(recorded.recording, None)
     row, _ = tabulate_replay(recorded, log.name, model or RECORDED, folder, span)
     cells = dict(row.list_cells())
     del cells["log"], cells["model"]
-    return {name: value for name, value in cells.items() if isinstance(value, str | int | float)}
+    values: Row = {name: v for name, v in cells.items() if isinstance(v, str | int | float)}
+    return {"intact": recorded.recording.is_intact, **values}
 
 
 def identify_log(log: Path, model: str | None, folder: Path) -> Row:
