@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from table_io.block import Block
+from table_io.block import Block, join_blocks
 from table_io.errors import InputError
 from tests.discovery.played import TRUE, blocks, format_truth, log
 from twin.discovery.signals import build_signals
@@ -102,6 +102,42 @@ def test_an_assumed_sensor_gives_the_motion_of_its_corrected_readings(
         for own, other in pairs:
             assert own.body == other.body
             np.testing.assert_allclose(own.values, other.values, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "lost",
+    [("mass_acc_m_s2",), ("mass_disp_m",), ("rel_disp_m",), ("mass_disp_m", "mass_acc_m_s2")],
+)
+def test_half_a_second_without_a_sensor_is_no_error_of_the_motion_beside_it(
+    lost: tuple[str, ...],
+) -> None:
+    measured = join_blocks(blocks())
+    if "rel_disp_m" in lost:
+        measured = replace_lasers(measured)
+    values = measured.values.copy()
+    middle = len(measured) // 2
+    for name in lost:
+        place = measured.channels.index(name)
+        values[place, middle : middle + round(0.5 * measured.rate_hz)] = np.nan
+    whole, cut = (
+        build_signals((block,), "log", 550.0, (0.002, 0.002))
+        for block in (measured, replace(measured, values=values))
+    )
+    motion, expected = cut.fuse_motion(), whole.fuse_motion()
+    used = motion.moving & cut.good
+    assert used.sum() < (expected.moving & whole.good).sum()
+    for name, noise in (("u", expected.noise.u), ("v", expected.noise.v)):
+        error = (getattr(motion, name) - getattr(expected, name))[used]
+        assert np.abs(error).max() < 0.1 * noise, name
+
+
+def replace_lasers(block: Block) -> Block:
+    """Return a block whose laser reads the distance of mass and table."""
+    lasers = [block.channels.index(name) for name in ("mass_disp_m", "table_disp_m")]
+    others = [k for k in range(len(block.channels)) if k not in lasers]
+    relative = block.values[lasers[0]] - block.values[lasers[1]]
+    names = ("rel_disp_m", *(block.channels[k] for k in others))
+    return replace(block, channels=names, values=np.array([relative, *block.values[others]]))
 
 
 def test_without_displacement_there_is_nothing_to_learn() -> None:

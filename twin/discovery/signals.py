@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.fft import irfft
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import spectrogram
 from scipy.stats import chi2
 
-from table_io.block import Block, Bool2D, Float1D, Int1D, Label, join_with_gaps
+from table_io.block import Block, Bool2D, Float1D, Int1D, Label, find_stretches, join_with_gaps
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.compare.hum import remove_hum
@@ -34,6 +35,7 @@ from twin.discovery.noise import (
 from twin.model.model import SensorModel
 
 LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
+FILL_ROUNDS = 20  # in which lost samples of a sensor approach what the other one of its body tells
 OPEN_END_S = 0.5  # excluded at each end of the record
 # Of the power of a drive with a single frequency: within this width, of the frequency, about it.
 MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
@@ -50,6 +52,10 @@ BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
     ("table", "table_disp_m", "table_acc_m_s2"),
 )
+RELATIVE_SIGNS = {
+    "mass_acc_m_s2": 1.0,
+    "table_acc_m_s2": -1.0,
+}  # of what rel_disp_m is the integral
 SENSOR_PAIRS: Mapping[str, tuple[str, ...]] = {
     **{body: (laser, accelerometer) for body, laser, accelerometer in BODY_SENSORS},
     "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
@@ -356,8 +362,7 @@ class _SensorFusion:
                 for (body, laser, accelerometer), sign in zip(BODY_SENSORS, (1, -1), strict=True)
             ]
         else:
-            accelerometers = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
-            densities = [self._weigh("mass against table", 1, "rel_disp_m", accelerometers)]
+            densities = [self._weigh("mass against table", 1, "rel_disp_m", RELATIVE_SIGNS)]
         # what passes of the noise, and what is lost of the motion
         self.density = np.hypot.reduce(densities) * np.sqrt(signals.motion_pass)
         density = self.density * self.low_pass
@@ -530,7 +535,6 @@ def build_signals(
     # also where the drive rests: the mass may not yet
     usable[:margin], usable[-margin:] = False, False
     size = -(-len(block) // grid.decimation)
-    spectra = {key: grid.to_spectrum(values) for key, values in columns.items()}
     frequency = grid.omega / (2 * np.pi * block.rate_hz)
     noise = {
         key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
@@ -539,6 +543,9 @@ def build_signals(
         key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
     }
     rest_noise = {key: value for key, value in measured.items() if value is not None}
+    spectra = {
+        key: grid.to_spectrum(values) for key, values in _fill_lost(columns, grid, noise).items()
+    }
     without_hum, hum_hz = remove_hum(spectra, grid, at_rest, _find_drive_hz(block))
     signals = LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
@@ -563,6 +570,47 @@ def build_signals(
     removed = u - grid.apply_gain(u, gain)
     is_whole = _is_noise(signals, removed, density * (1.0 - gain))
     return replace(signals, motion_pass=gain) if is_whole else signals
+
+
+def _fill_lost(
+    columns: Mapping[str, Float1D], grid: FrequencyGrid, noise: Mapping[str, Float1D]
+) -> dict[str, Float1D]:
+    """Return the columns, (sample,) each, with lost samples as the other sensors of a body tell.
+
+    A straight line in their place is an error of the fused motion for as long as its slowest
+    frequency that is taken from an accelerometer, far beyond the margin that is excluded. A lost
+    displacement follows the accelerations but for what is slower than its longest lost stretch.
+    """
+    filled = dict(columns)
+    has_lasers = {"mass_disp_m", "table_disp_m"} <= columns.keys()
+    groups = [(laser, {acc: 1.0}) for _, laser, acc in BODY_SENSORS]
+    for laser, signs in groups if has_lasers else [("rel_disp_m", RELATIVE_SIGNS)]:
+        if not {laser, *signs} <= columns.keys():
+            continue
+        is_lost = {name: np.isnan(columns[name]) for name in (laser, *signs)}
+        lossy = [name for name in signs if is_lost[name].any()]
+        is_alone = is_lost[laser] & ~np.logical_or.reduce([is_lost[name] for name in signs])
+        longest = max((end - first for first, end in find_stretches(is_alone)), default=1)
+        acc_noise = np.hypot.reduce([noise[name] for name in signs])
+        loud = np.maximum(noise[laser], acc_noise / (np.pi * grid.rate_hz / longest) ** 2)
+        shares, slow_shares = (
+            weigh_sensors(grid.omega, density, acc_noise) for density in (noise[laser], loud)
+        )
+        for _ in range(FILL_ROUNDS if lossy or is_lost[laser].any() else 0):
+            spectra = {name: grid.to_spectrum(filled[name]) for name in is_lost}
+            acc = np.sum([sign * spectra[name] for name, sign in signs.items()], axis=0)
+            u, slow_u = (
+                grid.low_pass * (of_laser * spectra[laser] + of_acc * acc)
+                for of_laser, of_acc, _ in (shares, slow_shares)
+            )
+            excess = grid.low_pass * acc + grid.omega**2 * u
+            corrected = {name: spectra[name] - signs[name] / len(lossy) * excess for name in lossy}
+            for name, spectrum in {laser: u, **corrected}.items():
+                values = irfft(spectrum, grid.padded_size)[: grid.size]
+                filled[name] = np.where(is_lost[name], values, filled[name])
+            values = irfft(slow_u, grid.padded_size)[: grid.size]
+            filled[laser] = np.where(is_alone, values, filled[laser])
+    return filled
 
 
 def _find_drive_hz(block: Block) -> Float1D:
