@@ -2,17 +2,18 @@
 
 import base64
 import math
+import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from jinja2 import Environment, FileSystemBytecodeCache, FileSystemLoader, StrictUndefined
+from platformdirs import user_cache_path
 
 from twin.drawing.panels import Picture
 
 TEMPLATE_DIR = Path(__file__).parent  # contains the shared parts.html and style.html
-
-
+CACHE_DIR = user_cache_path("shaketwin") / "templates"  # compiled, by the hash of their texts
 MAX_PLAIN = 1e12  # larger numbers are written as a power of ten
 
 
@@ -37,9 +38,19 @@ def render_page(template: Path, **values: Any) -> str:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        bytecode_cache=_open_cache(),
     )
     environment.filters["sig"] = format_significant
     return environment.get_template(template.name).render(**values)
+
+
+def _open_cache() -> FileSystemBytecodeCache | None:
+    """Return the cache of compiled templates; None where its folder cannot be written."""
+    try:
+        CACHE_DIR.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return None
+    return FileSystemBytecodeCache(str(CACHE_DIR)) if os.access(CACHE_DIR, os.W_OK) else None
 
 
 def write_page(folder: Path, template: Path, **values: Any) -> Path:
