@@ -211,6 +211,16 @@ def test_a_channel_that_was_not_tared_hides_no_law() -> None:
     assert offset == pytest.approx(400.0, rel=0.02)
 
 
+def test_what_leaves_a_misfit_gives_way_to_what_predicts_held_out_steps_best() -> None:
+    discovery = discover(format_truth("bumper_hardening", k2=3e7))
+    problem, selection = discovery.prepared.problem, discovery.selection
+    assert not problem.leaves_noise(selection.null)
+    verdict = judge_selection(problem, replace(selection, best=selection.null), 1.0)
+    assert verdict.best.names == ("bumper_hardening",)
+    assert all(not problem.is_worthwhile(verdict.best, each) for each in selection.tried)
+
+
+@pytest.mark.slow  # 20 s
 def test_without_the_truth_in_the_library_nothing_is_named_with_confidence() -> None:
     prepared = log(format_truth("coulomb_friction", fc=30.0))
     discovery = discover_effects(

@@ -12,6 +12,7 @@ from scipy.signal import resample_poly
 from tests.recovery.recordings import log_columns, oscillator
 from twin.discovery.discover import PreparedLog, discover_effects
 from twin.discovery.held_out import compute_force_error
+from twin.discovery.law_search import propose_law
 from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET
 from twin.model.model import Model
 
@@ -101,3 +102,29 @@ def test_rubber_bearings_have_hysteresis_and_more() -> None:
     )
     assert after < 0.7 * 0.479
     assert after < without
+
+
+@pytest.mark.slow  # 40 s
+@pytest.mark.parametrize("trained", [0, 1])
+def test_an_adjustable_damper_has_hysteresis_and_damping_that_differs_by_direction(
+    trained: int,
+) -> None:
+    """At one frequency and amplitude, cold and warming: to beat, a spring and dashpot with 0.34."""
+    names = "t1_3_3_24_24_s5_n10_100psi", "t1_3_3_24_24_s5_n100_100psi_with_heat_gun"
+    logs = []
+    for name in names:
+        rows = table(DATA / "damper_dyno" / f"{name}.csv", 1, 2)
+        columns = {"rel_disp_m": 1e-3 * rows[:, 0], "damper_force_n": rows[:, 1]}
+        logs.append(log_columns(name, 300.0, columns))
+    discovery = discover_effects([logs[trained]], oscillator(3.6e4, 1.1e3))
+    law, verdict = propose_law(discovery), discovery.verdict
+    fitted = law.fitted if law else verdict.best
+    assert verdict.outcome == "unexplained"
+    assert any("hysteresis" in name or "bouc_wen" in name for name in fitted.names)
+    assert not any("drift" in name or "settling" in name for name in fitted.names)
+    apart = logs[1 - trained]
+    found, without = (
+        compute_force_error(apart, of.fit.parameters).nrmse
+        for of in (fitted, discovery.selection.null)
+    )
+    assert found < 0.4 * without

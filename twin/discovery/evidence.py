@@ -182,9 +182,8 @@ class LinearEvidence:
         states = [Hypothesis((), "", 0.0)]
         layer = self._rank([(c,) for c in columns])
         states += layer
-        for size, starts in ((2, PAIR_STARTS), (3, TRIPLE_STARTS)):
-            if size > max_effects:
-                break
+        for size in range(2, max_effects + 1):
+            starts = PAIR_STARTS if size == 2 else TRIPLE_STARTS
             layer = self._rank(
                 sorted(
                     {

@@ -103,7 +103,10 @@ def identify_parameters(
     prepared = prepare_problem(logs, model)
     problem = prepared.problem
     log_residuals = problem.log_residuals
-    joint, fixed = _fit_determined(log_residuals, prepared.parameters)
+    start = prepared.parameters
+    determined = select_observable(log_residuals, start)
+    fixed = tuple(parameter.key for parameter in start.free if parameter not in determined)
+    joint = fit_with_misfit(log_residuals, start.with_free(determined))
     joint = widen_intervals(joint, log_residuals)
     p = joint.parameters.to_model().base
     laws = (
@@ -141,15 +144,6 @@ def identify_parameters(
         warnings,
         (*prepared.notes, *find_implausible_parameters(model, joint)),
     )
-
-
-def _fit_determined(
-    log_residuals: Sequence[LogResiduals], start: ParameterSet
-) -> tuple[FitResult, tuple[ParameterKey, ...]]:
-    """Fit the parameters that the logs determine; return (fit, keys of the other parameters)."""
-    determined = select_observable(log_residuals, start)
-    fixed = tuple(parameter.key for parameter in start.free if parameter not in determined)
-    return fit_with_misfit(log_residuals, start.with_free(determined)), fixed
 
 
 def _estimate_asymmetry(

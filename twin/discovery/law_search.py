@@ -66,7 +66,7 @@ def propose_law(
 ) -> LawProposal | None:
     """Return a law for what a discovery leaves unexplained.
 
-    None if nothing is left unexplained, or no law helps.
+    None if nothing is left unexplained, or no law does better than the effects that are closest.
     """
     if is_explained(discovery):
         return None
@@ -75,7 +75,8 @@ def propose_law(
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     null, best = selection.null, discovery.verdict.best
     fitted_sets = search_laws(problem, null, best, report)
-    return select_law(problem, null, fitted_sets, nearest.names[0] if nearest else "")
+    law = select_law(problem, null, fitted_sets, nearest.names[0] if nearest else "")
+    return law if law and problem.is_worthwhile(best, law.fitted) else None
 
 
 def select_law(
@@ -90,7 +91,7 @@ def select_law(
     """
     if not fitted_sets:
         return None
-    best = _round_exponents(problem, _select_simplest(problem, fitted_sets))
+    best = _round_exponents(problem, problem.select_simplest(fitted_sets))
     before, after = problem.measure_misfit(null), problem.measure_misfit(best)
     closed_share = closed_fraction(before, after, problem.find_noise_floor(best))
     start = _drop_laws(problem, null, best)
@@ -126,11 +127,11 @@ def search_laws(
     Beside them the effects of `best` may stay, or some of them.
     """
     terms = list_new_terms(problem, null)
-    fitted_sets = _search_from(problem, null, (*best.effects, *terms), report)
+    fitted_sets = _search_from(problem, null, best, terms, report)
     if not any(map(problem.leaves_noise, fitted_sets[:1])):
         expressions = list_symbolic_candidates(problem.log_residuals, null.fit.parameters)
         if expressions:
-            fitted_sets += _search_from(problem, null, (*best.effects, *expressions), report)
+            fitted_sets += _search_from(problem, null, best, expressions, report)
     return sorted(fitted_sets, key=lambda fitted: fitted.cost)
 
 
@@ -150,17 +151,19 @@ def list_new_terms(problem: SelectionProblem, null: FittedSet) -> list[Candidate
 def _search_from(
     problem: SelectionProblem,
     null: FittedSet,
-    library: Sequence[Candidate],
+    closest: FittedSet,
+    terms: Sequence[Candidate],
     report: ProgressCallback,
 ) -> list[FittedSet]:
-    """Return the sets of a library with a term of a law that were fitted, best first."""
-    known = sum(not find_law_class(effect) for effect in library)
+    """Return the sets with a term of a law that were fitted about the closest one, best first."""
+    known = len(closest.effects)
     rounds = [
         RoundEffort("a law", count + known, refits, PROMISE_SHARE, if_open=count > 1)
         for count, refits in zip(range(1, MAX_TERMS + 1), (FIRST_REFITS, NEXT_REFITS), strict=True)
     ]
-    laws = replace(problem, library=tuple(library))
-    selection = select_effects(laws, null.fit.parameters, report, rounds=rounds)
+    laws = replace(problem, library=(*closest.effects, *terms))
+    first = closest if closest.effects else None
+    selection = select_effects(laws, null.fit.parameters, report, first, rounds)
     with_law = [each for each in selection.tried if any(map(find_law_class, each.effects))]
     with_law += _drop_terms(laws, with_law) if with_law else ()
     return sorted(with_law, key=lambda fitted: fitted.cost)
@@ -178,21 +181,6 @@ def _drop_terms(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> 
         kept = tuple(effect for effect in best.effects if effect is not dropped)
         if frozenset(effect.name for effect in kept) not in known:
             yield problem.fit_effects(dropped.remove_from(best.fit.parameters), kept)
-
-
-def _select_simplest(problem: SelectionProblem, fitted_sets: Sequence[FittedSet]) -> FittedSet:
-    """Return the set with the fewest parameters than which the best is not worth more."""
-    best = min(fitted_sets, key=lambda fitted: fitted.cost)
-    as_good = [
-        fitted
-        for fitted in fitted_sets
-        if fitted is best or not problem.is_worthwhile(fitted, best)
-    ]
-
-    def complexity(fitted: FittedSet) -> tuple[int, float]:
-        return sum(len(effect.free) for effect in fitted.effects), fitted.cost
-
-    return min(as_good, key=complexity)
 
 
 def _round_exponents(problem: SelectionProblem, fitted: FittedSet) -> FittedSet:

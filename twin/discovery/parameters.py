@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from table_io.block import Float1D
+from table_io.channels import CHANNEL_BY_NAME
 from table_io.errors import InputError
 from twin.discovery.motion import MeasuredMotion, RecordScale
 from twin.laws.effect import Effect, EffectParameter
@@ -348,10 +349,12 @@ def list_effect_parameters(
         vanishing = parameter.vanishing
         size = measure_size(parameter, effect, channel, scale)
         typical = abs(parameter.typical - (vanishing or 0.0)) or 1.0
+        is_reading = effect.acts == "sensor" and parameter.name == "offset"
+        unit = CHANNEL_BY_NAME[channel].unit if is_reading else parameter.unit
         free.append(
             FreeParameter(
                 EffectKey(effect.id, parameter.name, channel), low, high, size or typical,
-                parameter.unit, logarithmic=vanishing is None, vanishing=vanishing,
+                unit, logarithmic=vanishing is None, vanishing=vanishing,
             )
         )  # fmt: skip
     return tuple(free)

@@ -209,6 +209,18 @@ class SelectionProblem:
         share, row, errors = self.compute_gain(before, after)
         return share > 0 and row > MIN_GAIN_SHARE and errors > MIN_GAIN_SIGMA
 
+    def select_simplest(self, fitted_sets: Sequence[FittedSet]) -> FittedSet:
+        """Return the set with the fewest parameters than which the best is not worth more."""
+        best = min(fitted_sets, key=lambda fitted: fitted.cost)
+        as_good = [
+            each for each in fitted_sets if each is best or not self.is_worthwhile(each, best)
+        ]
+
+        def complexity(fitted: FittedSet) -> tuple[int, float]:
+            return sum(len(effect.free) for effect in fitted.effects), fitted.cost
+
+        return min(as_good, key=complexity)
+
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
