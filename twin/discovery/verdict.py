@@ -64,14 +64,13 @@ def judge_selection(
 ) -> DiscoveryVerdict:
     """Judge the outcome of a selection; `floor` is a mean square over the noise."""
     best, null = selection.best, selection.null
-    if not problem.leaves_noise(best):
-        # none explains the recordings: that which predicts held-out steps best is the closest
-        best = problem.select_simplest((best, *selection.tried, null))
     by_set = sum_by_set(selection.explanations)
     probability = by_set.get(frozenset(best.names), 0.0)
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
     remains = not problem.leaves_noise(best)
     has_remainder = beside > 0.5 or remains
+    if remains:  # that which predicts held-out steps best is the closest
+        best = problem.select_simplest((best, *selection.tried, null))
 
     def conclude(
         outcome: str, fitted: FittedSet, probability: float, reason: str,
