@@ -123,8 +123,8 @@ def test_an_adjustable_damper_has_hysteresis_and_damping_that_differs_by_directi
     assert any("hysteresis" in name or "bouc_wen" in name for name in fitted.names)
     assert not any("drift" in name or "settling" in name for name in fitted.names)
     apart = logs[1 - trained]
-    found, without = (
+    after, without = (
         compute_force_error(apart, of.fit.parameters).nrmse
         for of in (fitted, discovery.selection.null)
     )
-    assert found < 0.4 * without
+    assert after < 0.4 * without
