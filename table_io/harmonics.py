@@ -88,9 +88,9 @@ def _fit_harmonics(basis: Float2D, normal: Float2D, values: Float1D, harmonics: 
 def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> float:
     """Return the standard error of all harmonics of `track_harmonics`, their root sum of squares.
 
-    From the scatter of offset, sines and cosines between the cycles of `values`, (sample,), at the
-    `phase` in cycles, so noise of any spectrum counts as it passed a control loop. NaN if samples
-    are lost or of less than two cycles.
+    From the changes of offset, sines and cosines between successive cycles of `values`, (sample,),
+    at the `phase` in cycles: noise of any spectrum counts as it passed a control loop, and a trend
+    hardly. NaN if samples are lost or of less than two cycles.
     """
     basis = _harmonic_basis(phase, harmonics)
     cycles = math.floor(np.ptp(phase) + 0.5) if phase.size else 0
@@ -102,7 +102,7 @@ def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> 
     means = np.add.reduceat(residual[:, None] * basis, starts)
     means /= np.diff(np.append(starts, phase.size))[:, None]
     means[:, 1:] *= 2.0  # the mean square of a sine is a half
-    return float(np.sqrt(means.var(axis=0, ddof=1).sum() / cycles))
+    return float(np.sqrt(0.5 * (np.diff(means, axis=0) ** 2).mean(axis=0).sum() / cycles))
 
 
 SWING_HARMONICS = 30  # of u: an impact on a bumper takes a tenth of a cycle or more
@@ -129,8 +129,8 @@ def find_steady_extremes(
 ) -> tuple[float, float] | None:
     """Return (max u, min u) in m of the harmonics of u, (sample,), over whole cycles of `phase`.
 
-    None if samples are lost, or where cycles that differ or higher harmonics leave more than the
-    noise and `max_left` of the swing.
+    None if samples are lost, where cycles that differ or higher harmonics leave more than the
+    noise and `max_left` of the swing, or more about an extreme than elsewhere: a short impact.
     """
     fit = track_harmonics(u, phase, SWING_HARMONICS)
     if not math.isfinite(fit.residual_rms):
@@ -143,7 +143,16 @@ def find_steady_extremes(
     # White noise of unit rms has a third difference of rms sqrt(20); the motion itself has none.
     square = float(np.mean(np.diff(u, 3) ** 2)) / 20.0 * (1.0 + NOISE_ERROR / math.sqrt(u.size))
     allowed = math.hypot(math.sqrt(square), 0.5 * max_left * (high - low))
-    return (high, low) if fit.residual_rms <= allowed else None
+    if fit.residual_rms > allowed:
+        return None
+    model = fit.offset + np.polyval([*kept[::-1], 0.0], np.exp(2j * np.pi * phase)).imag
+    extremes = np.array([[motion.argmax()], [motion.argmin()]]) / SWING_PHASES
+    near = np.abs((phase - extremes + 0.5) % 1.0 - 0.5) <= 0.5 / SWING_HARMONICS
+    squares = (u - model) ** 2
+    elsewhere = float(squares[~near.any(axis=0)].mean())
+    sizes = near.sum(axis=1)
+    most = elsewhere * sizes * (1.0 + NOISE_ERROR / np.sqrt(np.maximum(sizes, 1)))
+    return (high, low) if (near @ squares <= most).all() else None
 
 
 def _mean_range(u: Float1D, phase: Float1D) -> float:

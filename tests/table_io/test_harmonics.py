@@ -7,6 +7,7 @@ from table_io.block import Float1D
 from table_io.harmonics import (
     HARMONIC_COUNT,
     estimate_harmonic_error,
+    find_steady_extremes,
     track_channels,
     track_harmonics,
 )
@@ -107,3 +108,26 @@ def test_error_of_harmonics_needs_two_cycles_and_every_sample() -> None:
     assert np.isnan(estimate_harmonic_error(values[:700], phase[:700], 3))
     values[5] = np.nan
     assert np.isnan(estimate_harmonic_error(values, phase, 3))
+
+
+@pytest.mark.parametrize("samples", [100, 200, 400])  # of a cycle
+def test_a_short_impact_is_not_smoothed_into_its_swing(samples: int) -> None:
+    """A stiff bumper for a fiftieth of a cycle; 30 harmonics would take a fifth of it away."""
+    phase = 0.123 + np.arange(8 * samples) / samples
+    pushed = np.maximum(np.cos(2 * np.pi * (phase - 0.25)), 0.0) ** 400
+    u = np.sin(2 * np.pi * phase) + 0.02 * pushed
+    noisy = u + np.random.default_rng(1).normal(0.0, 3e-4, u.size)
+    ends = find_steady_extremes(noisy, phase)
+    assert ends is None or ends[0] == pytest.approx(1.02, abs=1e-3)
+    smooth = np.sin(2 * np.pi * phase) + 0.02 * np.sin(6 * np.pi * phase)
+    assert find_steady_extremes(smooth + noisy - u, phase) is not None
+
+
+def test_a_trend_between_cycles_is_no_noise_of_the_harmonics() -> None:
+    phase = np.arange(800) / 100.0
+    steady, trend = np.sin(2 * np.pi * phase), np.linspace(1.0, -0.5, phase.size)
+    noise = np.random.default_rng(2).normal(0.0, 0.01, phase.size)
+    known = estimate_harmonic_error(steady + noise, phase, 3)
+    error = estimate_harmonic_error(trend * steady + noise, phase, 3)
+    assert 0.0 < known < 0.01
+    assert error < 0.05  # the scatter of the cycles would be 0.17
