@@ -75,8 +75,8 @@ def propose_law(
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     null, best = selection.null, discovery.verdict.best
     fitted_sets = search_laws(problem, null, best, report)
-    law = select_law(problem, null, fitted_sets, nearest.names[0] if nearest else "")
-    return law if law and problem.is_worthwhile(best, law.fitted) else None
+    better = [each for each in fitted_sets if problem.is_worthwhile(best, each)]
+    return select_law(problem, null, better, nearest.names[0] if nearest else "")
 
 
 def select_law(

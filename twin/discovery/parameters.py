@@ -349,8 +349,9 @@ def list_effect_parameters(
         vanishing = parameter.vanishing
         size = measure_size(parameter, effect, channel, scale)
         typical = abs(parameter.typical - (vanishing or 0.0)) or 1.0
-        is_reading = effect.acts == "sensor" and parameter.name == "offset"
-        unit = CHANNEL_BY_NAME[channel].unit if is_reading else parameter.unit
+        unit = parameter.unit
+        if effect.acts == "sensor" and parameter.name == "offset" and channel in CHANNEL_BY_NAME:
+            unit = CHANNEL_BY_NAME[channel].unit
         free.append(
             FreeParameter(
                 EffectKey(effect.id, parameter.name, channel), low, high, size or typical,

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import zip_longest
 
 import numpy as np
 
@@ -277,7 +278,8 @@ def select_effects(
     """Select the most probable set of effects; see `evidence`.
 
     The linear model about a fit ranks all sets; the best are refitted, and ranked again about the
-    best of them, until no other set is more probable or all `rounds` are over. `first` is a set to
+    best of them, until no other set is more probable, nor a larger one tried, or all `rounds` are
+    over. `first` is a set to
     begin with, fitted to another problem.
     """
     null = problem.fit_effects(start, ())
@@ -286,13 +288,14 @@ def select_effects(
         state = replace(state, best=problem.fit_effects(first.add_to(start), first.effects))
         refitted[frozenset(first.names)] = state.best
     try:
-        for effort in rounds:
+        for effort, following in zip_longest(rounds, rounds[1:]):
             before = state.best
             closest = min(refitted.values(), key=lambda fitted: fitted.cost)
             if effort.if_open and problem.leaves_noise(closest):
                 break
             state = _advance(problem, state, refitted, report, effort)
-            if {*state.best.names} == {*before.names}:
+            goes_on = following is not None and following.max_effects > effort.max_effects
+            if {*state.best.names} == {*before.names} and not goes_on:
                 break
         return state
     except Cancelled:

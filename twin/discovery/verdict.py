@@ -69,8 +69,9 @@ def judge_selection(
     place, beside = find_stranger(selection.explanations, frozenset(best.names))
     remains = not problem.leaves_noise(best)
     has_remainder = beside > 0.5 or remains
-    if remains:  # that which predicts held-out steps best is the closest
-        best = problem.select_simplest((best, *selection.tried, null))
+    if remains:  # of the sets that do not explain it, that which predicts held-out steps best
+        sets = [each for each in (*selection.tried, null) if not problem.leaves_noise(each)]
+        best = problem.select_simplest((best, *sets))
 
     def conclude(
         outcome: str, fitted: FittedSet, probability: float, reason: str,
