@@ -97,8 +97,8 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
         index = _find_samples(kinds, filled)
     if index is None:
         return None
-    first = filled.index(index)
-    while first and _has_notes(kinds[filled[first - 1]], kinds[index]):
+    first, alike = filled.index(index), kinds[index]
+    while first and _has_notes(kinds[filled[first - 1]], alike):
         first, index = first - 1, filled[first - 1]
     width = len(kinds[index])
     rows_below = [kinds[k].ljust(width) for k in filled[first:]]
@@ -150,13 +150,20 @@ def _find_numbers(
         width = len(kinds[index])
         if below and set(kinds[below[0]]) <= {"n", " "} and len(kinds[below[0]]) == width:
             return index
-        if (not place and not below) or (place and _fit_names(rows[filled[place - 1]], width)):
+        above = filled[place - 1] if place else index
+        is_named = bool(place) and "t" in kinds[above] and bool(_fit_names(rows[above], width))
+        if (not place and not below) or is_named:
             return index
     return None
 
 
 def _has_notes(above: str, first: str) -> bool:
-    """Return True if a row has the numbers of the first sample, and text where that has none."""
+    """Return True if a row has the numbers of the first sample, and text where that has none.
+
+    Or, above numbers with units, what no row of names is: numbers that may lack a unit or a cell.
+    """
+    if "q" in first and "t" not in above:
+        return len(above) <= len(first)
     is_same = all(b in (a, " ") for a, b in zip(above, first, strict=False))
     return "t" in above and len(first) <= len(above) and is_same
 

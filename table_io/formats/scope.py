@@ -54,7 +54,7 @@ def parse_scope(file: TextIO, path: Path) -> ForeignTable:
         for name, column in table.columns.items()
         if column.unit != COUNTER
     }
-    return replace(table, columns=columns, dropped={})
+    return replace(table, columns=columns)
 
 
 def parse_settings(file: TextIO, path: Path) -> ForeignTable:

@@ -28,6 +28,7 @@ INTERVAL_SPREAD = 0.01  # relative, of the steps of a column of times without a 
 MIN_RATE_HZ, MAX_RATE_HZ = 0.1, 1e6  # of a test on a table or a component
 MAX_PAUSES = 10  # in the notes
 MAX_WRAPPED_SHARE = 0.5  # of the mean square step down a column: that along a row of one series
+MAX_TURN = 4.0  # mean square of a step to the next row over that along a row, of one series
 PAUSE_SAMPLES = 10  # from which a gap is a pause, after which the clock may stand elsewhere
 MAX_APART_S = 1e4  # of two columns of times that may be those of different channels
 HOUR_S = 3600.0  # by which local clocks are moved for summer time
@@ -90,7 +91,8 @@ def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
             except InputError as error:
                 return f"column {name!r}: {error.where.rpartition(': ')[2]}: {error.problem}"
     for name, quantity in quantities.items():
-        if not quantity and (np.diff(table.read_column(name)) > 0).all():
+        steps = np.diff(table.read_column(name))
+        if not quantity and steps.size > 1 and (steps > 0).all():
             return f"column {name!r} rises throughout, but unevenly, and is no time by its name"
     return ""
 
@@ -98,7 +100,8 @@ def describe_unusable_times(table: ForeignTable, names: Sequence[str]) -> str:
 def describe_wrapped(table: ForeignTable) -> str:
     """Return that the rows of a table without names continue one another as one series, or "".
 
-    Then a step along a row is smaller than one down a column, which skips as many samples.
+    Then a step along a row is smaller than one down a column, which skips as many samples, and
+    like one from the end of a row to the next: sensors that move together turn back there.
     """
     names = [*table.columns]
     sizes = {column.size for column in table.columns.values()}
@@ -106,8 +109,10 @@ def describe_wrapped(table: ForeignTable) -> str:
     if len(names) < 3 or len(sizes) != 1 or not is_unnamed or table.dropped:
         return ""
     samples = np.array([table.read_column(name) for name in names]).T
-    along, down = np.diff(samples.reshape(-1)), np.diff(samples, axis=0)
-    if not np.nanmean(along**2) < MAX_WRAPPED_SHARE * np.nanmean(down**2):
+    along, down = np.diff(samples, axis=1), np.diff(samples, axis=0)
+    turn = samples[1:, 0] - samples[:-1, -1]
+    squares = [float(np.nanmean(steps**2)) for steps in (along, turn)]
+    if not max(squares) < min(MAX_WRAPPED_SHARE * np.nanmean(down**2), MAX_TURN * squares[0]):
         return ""
     return (
         f"its rows continue one another, a series of {samples.size} values in lines of "

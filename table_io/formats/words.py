@@ -146,12 +146,17 @@ def matches_words(words: Sequence[str], known: set[str]) -> bool:
 
 
 def find_quantity(name: str, unit: str = "") -> str:
-    """Return the quantity of a column by its unit, else by its name; "" if neither tells."""
+    """Return the quantity of a column by its unit, else by its name; "" if neither tells.
+
+    Beside another unit, as volts, a letter is no quantity: "Channel A" is the first one.
+    """
     stated = find_stated_unit(name, unit)
     if stated in TIME_UNITS:
         return "time"
-    by_unit = QUANTITY_UNITS.get(UNITS[stated][0]) if stated in UNITS else None
-    return by_unit or find_named_quantity(name)
+    if stated not in UNITS:
+        return find_named_quantity(name)
+    long_words = " ".join(word for word in split_words(name) if len(word) > 1)
+    return QUANTITY_UNITS.get(UNITS[stated][0]) or find_named_quantity(long_words)
 
 
 def find_named_quantity(name: str) -> str:

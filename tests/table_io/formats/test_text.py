@@ -11,6 +11,7 @@ from table_io.errors import InputError
 from table_io.formats import parse_text, read_table
 from table_io.formats.table import ForeignTable
 from table_io.formats.text import MAX_LINE_CHARS
+from table_io.formats.timing import describe_wrapped
 from tests.input_errors import raises_input_error
 
 GOOD = "time_s,table_acc_m_s2\n0,1.5\n0.1,-2e-3\n0.2,3\n"
@@ -257,3 +258,36 @@ def test_record_of_usgs_in_fixed_columns(tmp_path: Path) -> None:
     (tmp_path / "cut.smc").write_text("\n".join(lines[:-1]) + "\n")
     with raises_input_error(problem="15 samples, but 8 follow"):
         read_table(tmp_path / "cut.smc")
+
+
+@pytest.mark.parametrize("lost", [1, 100, 299])
+@pytest.mark.parametrize("mark", ["", "-", "NaN", "0"])
+def test_a_cell_without_its_unit_loses_no_sample(tmp_path: Path, lost: int, mark: str) -> None:
+    rows = [
+        f"{0.01 * k:.2f},{k}.5 mm" if k != lost else f"{0.01 * k:.2f},{mark}" for k in range(300)
+    ]
+    content = "time,acc\n" + "\n".join(rows) + "\n"
+    if mark in ("NaN", "0"):
+        with raises_input_error(where=f"{tmp_path / 'table.csv'}: row {lost + 2}, column 'acc'"):
+            read(tmp_path, content)
+        return
+    table = read(tmp_path, content)
+    assert {*table.columns} == {"time", "acc"}
+    assert table.read_column("time").tolist() == [round(0.01 * k, 2) for k in range(300)]
+    assert np.flatnonzero(np.isnan(table.read_column("acc"))).tolist() == [lost]
+
+
+def test_a_channel_of_an_oscilloscope_that_is_left_out_is_named(tmp_path: Path) -> None:
+    rows = "".join(f"{k},0.{k},OFF,,\n" for k in range(6))
+    table = read(tmp_path, f"X,CH1,CH2,Start,Increment\nSequence,Volt,Volt,-0.5,1e-3\n{rows}")
+    assert {*table.columns} == {"CH1"}
+    assert "OFF" in table.dropped["CH2"]
+
+
+def test_sensors_that_move_together_are_no_series_in_lines(tmp_path: Path) -> None:
+    phase = 0.5 * np.arange(200)[:, None] + [0.0, 0.1, 0.2]
+    together = "\n".join(",".join(f"{x:.4f}" for x in row) for row in np.sin(phase))
+    assert describe_wrapped(read(tmp_path, together)) == ""
+    series = np.sin(0.1 * np.arange(600)).reshape(-1, 3)
+    wrapped = "\n".join(",".join(f"{x:.4f}" for x in row) for row in series)
+    assert "600 values in lines of 3" in describe_wrapped(read(tmp_path, wrapped))
