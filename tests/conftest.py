@@ -12,6 +12,8 @@ from hypothesis import settings
 
 # Before anything is imported that computes; so whatever does is imported where it is needed.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# The process that reads a foreign file is forked, and what grpc does there once failed a check.
+os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 
 # Drawing was a fifth of the time of all tests. So every line is drawn, but coarsely and without
 # ticks, here and in the processes that tests start. `full_quality` is for tests of the pictures.
