@@ -77,12 +77,18 @@ def _fit_harmonics(basis: Float2D, normal: Float2D, values: Float1D, harmonics: 
     columns = basis.shape[1]
     if columns < 3 or values.size < 2 * columns or not np.isfinite(values).all():
         return NO_FIT
-    solution = np.linalg.solve(normal, np.einsum("ij,i->j", basis, values))
+    solution, residual = _solve_harmonics(basis, normal, values)
     amplitudes = np.zeros(harmonics, dtype=np.complex128)
     # a sin + b cos = Im((a + i b) exp(i theta))
     amplitudes[: columns // 2] = solution[1::2] + 1j * solution[2::2]
-    rms = float(np.sqrt(np.mean((values - np.einsum("ij,j->i", basis, solution)) ** 2)))
+    rms = float(np.sqrt(np.mean(residual**2)))
     return HarmonicFit(float(solution[0]), amplitudes, rms)
+
+
+def _solve_harmonics(basis: Float2D, normal: Float2D, values: Float1D) -> tuple[Float1D, Float1D]:
+    """Return (coefficients of the basis columns, residual (sample,)) by least squares."""
+    solution = np.linalg.solve(normal, np.einsum("ij,i->j", basis, values))
+    return solution, values - np.einsum("ij,j->i", basis, solution)
 
 
 def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> float:
@@ -96,8 +102,7 @@ def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> 
     cycles = math.floor(np.ptp(phase) + 0.5) if phase.size else 0
     if cycles < 2 or not np.isfinite(values).all():
         return math.nan
-    solution = np.linalg.solve(_normal_matrix(basis), np.einsum("ij,i->j", basis, values))
-    residual = values - np.einsum("ij,j->i", basis, solution)
+    _, residual = _solve_harmonics(basis, _normal_matrix(basis), values)
     starts = np.searchsorted(phase, phase[0] + np.arange(cycles))
     means = np.add.reduceat(residual[:, None] * basis, starts)
     means /= np.diff(np.append(starts, phase.size))[:, None]
