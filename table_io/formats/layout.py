@@ -98,7 +98,7 @@ def find_layout(rows: Sequence[Sequence[str]]) -> TableLayout | None:
     if index is None:
         return None
     first, alike = filled.index(index), kinds[index]
-    while first and _has_notes(kinds[filled[first - 1]], alike):
+    while first and _is_sample(kinds[filled[first - 1]], alike):
         first, index = first - 1, filled[first - 1]
     width = len(kinds[index])
     rows_below = [kinds[k].ljust(width) for k in filled[first:]]
@@ -157,10 +157,11 @@ def _find_numbers(
     return None
 
 
-def _has_notes(above: str, first: str) -> bool:
-    """Return True if a row has the numbers of the first sample, and text where that has none.
+def _is_sample(above: str, first: str) -> bool:
+    """Return True if the row above the first that is alike with those below is a sample, too.
 
-    Or, above numbers with units, what no row of names is: numbers that may lack a unit or a cell.
+    It has notes: the numbers of the first one, and text where that has none. Or, above numbers with
+    units, it has no text, as names have: a unit or a cell is missing.
     """
     if "q" in first and "t" not in above:
         return len(above) <= len(first)

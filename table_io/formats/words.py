@@ -155,13 +155,16 @@ def find_quantity(name: str, unit: str = "") -> str:
         return "time"
     if stated not in UNITS:
         return find_named_quantity(name)
-    long_words = " ".join(word for word in split_words(name) if len(word) > 1)
-    return QUANTITY_UNITS.get(UNITS[stated][0]) or find_named_quantity(long_words)
+    by_unit = QUANTITY_UNITS.get(UNITS[stated][0])
+    return by_unit or find_named_quantity(name, with_letters=False)
 
 
-def find_named_quantity(name: str) -> str:
-    """Return the one quantity that the words of a name tell; "" if there is none, or several."""
-    words = split_words(name)
+def find_named_quantity(name: str, with_letters: bool = True) -> str:
+    """Return the one quantity that the words of a name tell; "" if there is none, or several.
+
+    Without `with_letters` a single letter is no word of it.
+    """
+    words = [word for word in split_words(name) if with_letters or len(word) > 1]
     long_words = [word for word in words if len(word.rstrip("0123456789")) > 1]
     quantities = [key for key, known in QUANTITY_WORDS.items() if matches_words(words, known)]
     if len(quantities) > 1:  # "acc x": a letter may be an axis

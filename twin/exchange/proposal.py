@@ -226,7 +226,7 @@ def _find_rate(table: ForeignTable, names: list[str]) -> tuple[float | None, str
 
 def _ask_contradiction(table: ForeignTable, name: str, quantity: str) -> str:
     """Return the question of a column whose name and unit tell two quantities, or ""."""
-    named = find_named_quantity(" ".join(word for word in split_words(name) if len(word) > 1))
+    named = find_named_quantity(name, with_letters=False)
     if named in ("", quantity):
         return ""
     unit = find_stated_unit(name, table.columns[name].unit)
