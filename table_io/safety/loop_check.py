@@ -561,6 +561,11 @@ REMEDIES = {
 }
 
 
+def find_friction_level(profile: Profile, rig: RigConfig) -> float:
+    """Return the level in m/s2 that a rig with friction asks for, at most that of the test."""
+    return min(rig.table_response.least_level_g * GRAVITY_M_S2, profile.plan.level_m_s2)
+
+
 def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     """Plan the steady motions of the check as sine targets, lowest frequency first.
 
@@ -572,8 +577,7 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     """
     plan, settings = profile.plan, profile.loop_check
     test_level = plan.level_m_s2
-    least = min(rig.table_response.least_level_g * GRAVITY_M_S2, test_level)
-    lowest = max(settings.level * test_level, least)
+    lowest = max(settings.level * test_level, find_friction_level(profile, rig))
     min_amplitude_m = rig.output.least_lsb * rig.output.lsb_m
 
     def limit_frequency(f: float) -> float:

@@ -20,7 +20,7 @@ from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.excitation.swept_sine import SweptSine
 from table_io.config.profile import Profile
 from table_io.excitation.drive import Drive, HistorySegment
-from table_io.safety.loop_check import MAX_LEVEL_RATIO, plan_targets
+from table_io.safety.loop_check import find_friction_level, plan_targets
 from table_io.safety.preflight import (
     CORRECTION_HEADROOM,
     RigLimit,
@@ -138,9 +138,10 @@ def _plan_lines(config: RunConfig) -> list[tuple[str, str]]:
             f"{', '.join(f'{target.frequency_hz:.3g}' for target in targets)} Hz at "
             f"{' to '.join(levels)} g, then {profile.loop_check.rest_s:g} s of rest"
         )
-        share = max(target.level_m_s2 for target in targets) / profile.plan.level_m_s2
-        least_g = rig.table_response.least_level_g
-        if least_g * GRAVITY_M_S2 > MAX_LEVEL_RATIO * profile.plan.level_m_s2:
+        level = profile.plan.level_m_s2
+        share = max(target.level_m_s2 for target in targets) / level
+        if find_friction_level(profile, rig) > profile.loop_check.level * level:
+            least_g = rig.table_response.least_level_g
             check += (
                 f"; at {100 * share:.0f} % of the level, not a tenth: below "
                 f"table_response.least_level_g = {least_g:g} friction shapes what this table plays"
