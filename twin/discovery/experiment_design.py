@@ -179,6 +179,7 @@ def is_confirmation(rivals: Sequence[Rival]) -> bool:
 
 
 def _mean(values: Sequence[float] | Float1D) -> float:
+    """Return the mean; 0 of nothing."""
     return float(np.mean(values)) if len(values) else 0.0
 
 

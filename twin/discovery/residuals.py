@@ -120,7 +120,7 @@ class SampledMotion:
     """Motion at the samples where forces are needed, and whole: some depend on its history.
 
     `contact` (2, sample) is the contact state at these samples. `known_forces` are those of the
-    last models and tare errors of u: most parameters of a fit change no force, or that alone.
+    last models and tare errors of u: some parameters of a fit, as other tares, change no force.
     """
 
     whole: MeasuredMotion

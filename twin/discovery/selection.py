@@ -278,9 +278,8 @@ def select_effects(
     """Select the most probable set of effects; see `evidence`.
 
     The linear model about a fit ranks all sets; the best are refitted, and ranked again about the
-    best of them, until no other set is more probable, nor a larger one tried, or all `rounds` are
-    over. `first` is a set to
-    begin with, fitted to another problem.
+    best of them, until no other set is more probable and no larger one is to be tried, or all
+    `rounds` are over. `first` is a set to begin with, fitted to another problem.
     """
     null = problem.fit_effects(start, ())
     state, refitted = SelectionResult(null, null), {frozenset[str](): null}

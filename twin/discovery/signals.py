@@ -52,10 +52,8 @@ BODY_SENSORS = (
     ("mass", "mass_disp_m", "mass_acc_m_s2"),
     ("table", "table_disp_m", "table_acc_m_s2"),
 )
-RELATIVE_SIGNS = {
-    "mass_acc_m_s2": 1.0,
-    "table_acc_m_s2": -1.0,
-}  # of what rel_disp_m is the integral
+# Of the accelerations of which that of rel_disp_m is the sum.
+RELATIVE_SIGNS = {"mass_acc_m_s2": 1.0, "table_acc_m_s2": -1.0}
 SENSOR_PAIRS: Mapping[str, tuple[str, ...]] = {
     **{body: (laser, accelerometer) for body, laser, accelerometer in BODY_SENSORS},
     "mass against table": ("rel_disp_m", "mass_acc_m_s2", "table_acc_m_s2"),
