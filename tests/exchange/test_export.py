@@ -21,7 +21,7 @@ from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
 from twin.cli.table import app
 from twin.exchange.columns import read_samples
 from twin.exchange.export import ExportOptions, export_log
-from twin.exchange.labels import read_labels
+from twin.exchange.import_table import read_labels
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import read_recording
 from twin.recording.tabular import LABEL_UNITS, TWIN_PREFIX, iter_batches, read_log_table

@@ -14,8 +14,8 @@ from twin.laws.effect_file import EffectFile, format_effect_file
 from twin.laws.expression import FUNCTIONS, build_function, parse_expression, parse_unit
 from twin.laws.library import find_effect
 from twin.laws.properties import evaluate_law, is_linear_in_rate
-from twin.model.added_laws import compile_laws
 from twin.model.config import ModelConfig, load_model_config
+from twin.model.event_integrator import compile_laws
 from twin.model.inverse_dynamics import forces_along
 from twin.model.model import EffectInstance, Model
 from twin.model.prepare import prepare_solver

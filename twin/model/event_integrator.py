@@ -1,18 +1,27 @@
 """Event-driven solver of models with force laws or extra states: integrated, or exact if linear."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 
 from table_io.block import Float1D, Float2D
+from table_io.compilation import jit_kernel
 from table_io.errors import InputError
-from twin.laws.effect import DAMPER
-from twin.laws.properties import LawProperties, is_linear_in_rate, sum_law_properties
+from twin.laws.effect import DAMPER, PLACES, Effect
+from twin.laws.expression import build_function
+from twin.laws.properties import (
+    MAX_CONSTANTS,
+    MAX_STATES,
+    LawProperties,
+    is_linear_in_rate,
+    sum_law_properties,
+    write_laws,
+)
 from twin.model import closed_form
-from twin.model.added_laws import compile_laws, pack_constants
 from twin.model.event_integrator_kernel import (
     CLOCK,
     DIRECTION,
@@ -23,6 +32,7 @@ from twin.model.event_integrator_kernel import (
     build_kernel,
 )
 from twin.model.force_laws import (
+    ADDED_LAWS_SIGNATURE,
     NO_STATES,
     NO_WALL_M,
     AddedLaws,
@@ -284,3 +294,35 @@ def bisect(function: Callable[[float], float], low: float, high: float) -> float
         else:
             low = middle
     return 0.5 * (low + high)
+
+
+def pack_constants(
+    laws: Sequence[tuple[Effect, tuple[float, ...]]],
+) -> tuple[float, ...] | None:
+    """Return the constants of all laws, padded to `MAX_CONSTANTS`; None without, error if many."""
+    if not laws:
+        return None
+    values = [value for _, constants in laws for value in constants]
+    state_count = sum(len(PLACES[effect.place]) * len(effect.states) for effect, _ in laws)
+    for count, limit, what in (
+        (len(values), MAX_CONSTANTS, "constants"),
+        (state_count, MAX_STATES, "states, those of each bumper counted"),
+    ):
+        if count > limit:
+            raise InputError(
+                f"the laws of {', '.join(effect.id for effect, _ in laws)} have {count} {what}",
+                allowed=f"at most {limit} in total",
+                remedy="remove an effect",
+            )
+    return (*values, *[0.0] * (MAX_CONSTANTS - len(values)))
+
+
+def compile_laws(effects: Sequence[Effect]) -> AddedLaws | None:
+    """Compile the laws of these effects into one function, None for none."""
+    return _compile_text(write_laws(tuple(effects))) if effects else None
+
+
+@cache
+def _compile_text(text: str) -> AddedLaws:
+    """Compile the text of laws; effects that differ in names, bounds or ranges alone share it."""
+    return jit_kernel(ADDED_LAWS_SIGNATURE)(build_function(text))
