@@ -12,9 +12,9 @@ from tests.bench.peers import AG, diffrax_sweep
 from tests.bench.test_bench_peers import ATOL, CYCLES, G4, REGULAR, RTOL, WHOLE, seconds
 from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
-from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.store import make_seeds
 from twin.studies.maps.study import Study
+from twin.studies.maps.task import compute_outcomes
 
 CASES, VMAP_CASES = 200, 1000
 STUDY = """

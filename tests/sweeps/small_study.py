@@ -3,9 +3,9 @@
 from pathlib import Path
 
 from twin.studies.maps.cases import sample_parameters
-from twin.studies.maps.compute import compute_chunk, make_sweep_plan
 from twin.studies.maps.store import Manifest, create_store
 from twin.studies.maps.study import Study
+from twin.studies.maps.task import compute_chunk, make_sweep_plan
 
 TEST = """
 title = "Across the jumps of G4"

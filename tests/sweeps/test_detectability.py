@@ -11,9 +11,9 @@ from twin.detectability import describe_truth, make_rig_toml, play_test, state_c
 from twin.laws.library import find_effect
 from twin.model.model import EffectInstance, Model
 from twin.studies.maps.cases import SampledCase
-from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.store import make_seeds
 from twin.studies.maps.study import Study
+from twin.studies.maps.task import compute_outcomes
 
 
 @pytest.fixture(scope="module")

@@ -25,10 +25,9 @@ from tests.system.clusters import start_cluster, start_quietly
 from twin.api import open_study
 from twin.studies import DEFINITION_FILE, command
 from twin.studies.maps import store, task
-from twin.studies.maps.compute import compute_chunk, compute_outcomes
 from twin.studies.maps.store import MANIFEST_FILE, remove_partial_files
 from twin.studies.maps.study import Study
-from twin.studies.maps.task import MapOptions
+from twin.studies.maps.task import MapOptions, compute_chunk, compute_outcomes
 from twin.system import grid
 from twin.system.process_pool import TaskResult
 

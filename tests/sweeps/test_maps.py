@@ -26,13 +26,13 @@ from twin.model.ideal_response import simulate_sweep
 from twin.model.model import Model
 from twin.results.ideal_points import compute_prc_points
 from twin.studies.maps.cases import list_parameter_names, parameter_unit, sample_parameters
-from twin.studies.maps.compute import compute_outcomes
 from twin.studies.maps.config import StudyConfig
 from twin.studies.maps.figures import FrontGroup
 from twin.studies.maps.page import write_map_page
 from twin.studies.maps.results import compute_sensitivity, find_front
 from twin.studies.maps.store import make_seeds, open_group
 from twin.studies.maps.study import Study
+from twin.studies.maps.task import compute_outcomes
 
 HEAD = 'title = "T"\nprofile = "g4_ss3"\n'
 GAP = '[[parameters]]\nname = "specimen.gap_mm"\n'

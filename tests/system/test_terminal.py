@@ -17,7 +17,7 @@ from table_io.config.folders import find_config
 from table_io.records import Event, Fault, NormalizedResponse, PrcPoint, SampleGap
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import summary
-from twin.report.prc_table import print_prc
+from twin.inspection.curves import print_prc
 from twin.results.contracts import RunSummary
 from twin.setup import folders, warm_up
 from twin.setup.folders import make_output_folder, make_run_folder

@@ -49,6 +49,8 @@ MOTION_CHANNELS = (
 )  # steps are detected in the first one present
 NO_REST = "nothing is taken as rest: no channel has a zero, noise is taken from the motion"
 MAX_REST_SHARE = 0.1  # of the range of the motion, by which a channel may be off zero at rest
+MAX_COUNT = 10**6  # of steps, and of cycles in a step
+MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
 MAX_GAPS = 1000  # per channel: beyond, lost samples are only counted
 PLAIN_PROFILE = """\
 title = {title}
@@ -483,10 +485,6 @@ def _iter_lost_samples(grid: _SampleGrid) -> Iterator[Item]:
             yield Event(0, "warning", f"{name}: {count} of {grid.size} samples lost")
             continue
         yield from sorted(gaps, key=lambda gap: gap.index)
-
-
-MAX_COUNT = 10**6  # of steps, and of cycles in a step
-MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
 
 
 def read_labels(table: ForeignTable, samples: ImportedSamples) -> DetectedSteps:

@@ -318,7 +318,12 @@ def pack_constants(
 
 
 def compile_laws(effects: Sequence[Effect]) -> AddedLaws | None:
-    """Compile the laws of these effects into one function, None for none."""
+    """Compile the laws of these effects into one function, None for none.
+
+    They are those that the solver does not know by coefficients: a function of (place, deformation,
+    rate, base acceleration, time, states, constants), so that the solver itself is compiled and
+    cached only once, whatever effects a model has.
+    """
     return _compile_text(write_laws(tuple(effects))) if effects else None
 
 
