@@ -1,11 +1,13 @@
 """The Python interface: logs, fits and verdicts as objects."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from tests.builders.profiles import AT_1_KHZ_BY_50, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
@@ -88,26 +90,16 @@ HIDDEN_SPRING = """
 id = "saturating_stiffness"
 parameters = { stiffness = 4000.0, length = 0.006 }
 """
-TEST = """
-title = "short"
-rig = "rig.toml"
-[specimen]
-mass_kg = 550.0
-gap_mm = inf
-[sweep]
-start_hz = 1.0
-stop_hz = 2.0
-step_hz = 0.2
-cycles = 4
-acceleration_g = 0.05
-[acquisition]
-rate_hz = 1000.0
-block_samples = 50
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
+TEST = format_test(
+    1.0,
+    2.0,
+    0.2,
+    math.inf,
+    AT_1_KHZ_BY_50 | UNCHECKED,
+    rig="rig.toml",
+    measured_cycles=None,
+    acceleration_g=0.05,
+)
 
 
 @pytest.mark.slow  # two searches of a law

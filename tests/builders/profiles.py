@@ -1,8 +1,9 @@
 """Profiles of tests: a stepped sine or a history, with only what a test is about stated."""
 
+from collections.abc import Mapping
 from typing import Any
 
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import PROFILES_DIR, format_toml
 from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import Profile, Specimen, load_profile
 
@@ -15,6 +16,15 @@ gap_mm = 4.0
 kind = "record"
 file = "motion.csv"
 """
+UNCHECKED: Mapping[str, Mapping[str, Any]] = {
+    "loop_check": {"enabled": False},
+    "control": {"enabled": False},
+}
+NO_LOOP_CHECK: Mapping[str, Mapping[str, Any]] = {"loop_check": {"enabled": False}}
+AT_1_KHZ: Mapping[str, Mapping[str, Any]] = {"acquisition": {"rate_hz": 1000.0}}
+AT_1_KHZ_BY_50: Mapping[str, Mapping[str, Any]] = {
+    "acquisition": {"rate_hz": 1000.0, "block_samples": 50}
+}
 GRID = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 4, "measured_cycles": 2}
 
 
@@ -55,3 +65,27 @@ def list_shipped_sweeps() -> list[str]:
         for path in (PROFILES_DIR / "tests").glob("*.toml")
         if isinstance(load_profile(path)[0].excitation, Sweep)
     )
+
+
+def format_test(
+    start_hz: float,
+    stop_hz: float,
+    step_hz: float,
+    gap_mm: float = 4.0,
+    tables: Mapping[str, Mapping[str, Any]] | None = None,
+    title: str = "short",
+    rig: object = None,
+    model: object = None,
+    **sweep: Any,
+) -> str:
+    """Return the text of a stepped sine, by default of 4 cycles, 2 measured, up and down.
+
+    `sweep`: further keys of its table, None to leave one out; `tables`: further tables.
+    """
+    keys: dict[str, Any] = {"title": title}
+    keys |= {name: str(file) for name, file in (("rig", rig), ("model", model)) if file}
+    keys["specimen"] = {"mass_kg": 550.0, "gap_mm": gap_mm}
+    keys["sweep"] = {"start_hz": start_hz, "stop_hz": stop_hz, "step_hz": step_hz, "cycles": 4}
+    sweep = {"measured_cycles": 2} | sweep
+    keys["sweep"] |= {name: value for name, value in sweep.items() if value is not None}
+    return format_toml(keys | dict(tables or {}))

@@ -11,6 +11,7 @@ import pytest
 
 from table_io.block import Block
 from tests.builders.blocks import recut_blocks
+from tests.builders.profiles import AT_1_KHZ, NO_LOOP_CHECK, format_test
 
 if TYPE_CHECKING:
     from twin.recording.columns import StoredItems
@@ -18,24 +19,13 @@ if TYPE_CHECKING:
     from twin.setup.run_config import RunConfig
     from twin.transport.codec import Item
 
-PROFILE = """
-title = "Across the down-jump and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 1.0
-cycles = 4
-measured_cycles = 2
-[loop_check]
-enabled = false
-[acquisition]
-rate_hz = 1000.0
-[recording]
-predictions = "all"
-"""
+PROFILE = format_test(
+    2.4,
+    4.4,
+    1.0,
+    title="Across the down-jump and back",
+    tables=NO_LOOP_CHECK | AT_1_KHZ | {"recording": {"predictions": "all"}},
+)
 
 
 @pytest.fixture(scope="session")

@@ -8,31 +8,29 @@ from typing import Any, ClassVar
 
 import pytest
 
+from tests.builders.profiles import format_test
 from twin.campaign import command, players, state
 from twin.campaign.command import CampaignOptions
 from twin.campaign.result import CampaignInfo, CampaignSummary
 from twin.campaign.state import read_state
 from twin.live.process_config import ProcessConfig
 
-TEST = """
-title = "{name}"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = 3.0
-stop_hz = 4.0
-step_hz = 0.5
-cycles = 4
-acceleration_g = {level}
-"""
-
 
 def write(folder: Path, **gaps: str) -> None:
     """A test profile of each name, of that gap; "4.0 0.02" also has a level."""
     for name, setting in gaps.items():
         gap, level = (*setting.split(), "0.05")[:2]
-        (folder / f"{name}.toml").write_text(TEST.format(name=name, gap=gap, level=level))
+        (folder / f"{name}.toml").write_text(
+            format_test(
+                3.0,
+                4.0,
+                0.5,
+                float(gap),
+                title=name,
+                measured_cycles=None,
+                acceleration_g=float(level),
+            )
+        )
 
 
 LISTED = """

@@ -1,6 +1,7 @@
 """A campaign on the simulated table, whole, and killed at a random point and resumed."""
 
 import json
+import math
 import os
 import random
 import re
@@ -14,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from tests.builders.profiles import AT_1_KHZ, format_test
 from tests.campaign.campaigns import Players
 from twin.campaign import report, state
 from twin.campaign.command import CampaignOptions, run_campaign
@@ -37,29 +39,13 @@ prompt = "Take the bumpers away"
 profile = "g4.toml"
 prompt = "Set 4 mm"
 """
-TEST = """
-title = "{name}"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = {start}
-stop_hz = {stop}
-step_hz = {step}
-cycles = {cycles}
-measured_cycles = 2
-directions = {directions}
-[loop_check]
-cycles = 3
-[acquisition]
-rate_hz = 1000.0
-"""
+TABLES = AT_1_KHZ | {"loop_check": {"cycles": 3}}
 TESTS = {
-    "free": {"gap": "inf", "start": 1.0, "stop": 1.6, "step": 0.3, "cycles": 3,
-             "directions": ["forward"]},
-    "g4": {"gap": "4.0", "start": 2.6, "stop": 4.4, "step": 0.6, "cycles": 6,
-           "directions": ["forward", "backward"]},
-}  # fmt: skip
+    "free": format_test(
+        1.0, 1.6, 0.3, math.inf, title="free", cycles=3, directions=["forward"], tables=TABLES
+    ),
+    "g4": format_test(2.6, 4.4, 0.6, title="g4", cycles=6, tables=TABLES),
+}
 RELATIVE_TOLERANCE = (
     0.025  # of a curve: the level is only held within 2 %, and noise goes on elsewhere
 )
@@ -89,8 +75,8 @@ class Both:
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Both:
     folder = tmp_path_factory.mktemp("campaigns")
-    for name, values in TESTS.items():
-        (folder / f"{name}.toml").write_text(TEST.format(name=name, **values))
+    for name, text in TESTS.items():
+        (folder / f"{name}.toml").write_text(text)
     (folder / "c.toml").write_text(LISTED)
     whole, killed = folder / "whole", folder / "killed"
     with pytest.MonkeyPatch.context() as patch:

@@ -14,6 +14,7 @@ from rich.console import Console
 from table_io.config.base import PROFILES_DIR
 from table_io.safety.preflight import list_limits
 from table_io.units import GRAVITY_M_S2
+from tests.builders.profiles import format_test
 from tests.builders.rigs import RIG_TEXT, read_model_text, read_rig_text
 from tests.command_line import call_main
 from twin.rig.check import check_config, find_worst_rows, print_plan, select_rows, sum_durations_s
@@ -23,18 +24,7 @@ from twin.setup.folders import make_output_folder, remove_empty_folders
 from twin.setup.run_config import RunConfig, from_texts, read_run_config
 
 SNM = read_model_text("snm")
-TEST = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.0
-stop_hz = 3.4
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-"""
+TEST = format_test(3.0, 3.4, 0.2, title="Short")
 
 
 def bundle(test: str = TEST, rig: str = RIG_TEXT) -> RunConfig:

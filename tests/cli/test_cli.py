@@ -14,23 +14,13 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
+from tests.builders.profiles import format_test
 from tests.command_line import call_main
 from twin.cli import table as cli
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 ROOT = Path(__file__).resolve().parents[2]
-SHORT = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.4
-stop_hz = 3.6
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-"""
+SHORT = format_test(3.4, 3.6, 0.2)
 
 
 def shaketwin(*words: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:

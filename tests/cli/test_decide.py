@@ -1,6 +1,7 @@
 """`discover --decide`: the proposal, the rig that plays it or refuses, the operator, the chain."""
 
 import json
+import math
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ import pytest
 
 from table_io.config.profile import Profile
 from table_io.errors import InputError
+from tests.builders.profiles import AT_1_KHZ_BY_50, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
@@ -23,27 +25,6 @@ from twin.setup.unpaced import play_unpaced
 from twin.system import terminal
 from twin.system.exit_codes import EXIT_INTERRUPTED
 
-PROFILE = """
-title = "one frequency"
-rig = "{rig}"
-[specimen]
-mass_kg = 550.0
-gap_mm = inf
-[sweep]
-start_hz = 2.0
-stop_hz = 2.0
-step_hz = 1.0
-cycles = 15
-acceleration_g = 0.05
-directions = ["forward"]
-[acquisition]
-rate_hz = 1000.0
-block_samples = 50
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
 TRUTH = '[[effects]]\nid = "maxwell_damper"\nparameters = { k1 = 12000.0, tau = 0.06 }\n'
 KEPT = ("maxwell_damper", "quadratic_damping")
 OTHERS = [effect.id for effect in EFFECTS if effect.id not in KEPT]  # left out: it is quick
@@ -54,7 +35,20 @@ def record_run(folder: Path, truth: str = "") -> Path:
     folder.mkdir(parents=True)
     (folder / "rig.toml").write_text(hide_truth(RIG_TEXT, folder, truth))
     profile, log = folder / "p.toml", folder / "first.mcap"
-    profile.write_text(PROFILE.format(rig=folder / "rig.toml"))
+    profile.write_text(
+        format_test(
+            2.0,
+            2.0,
+            1.0,
+            math.inf,
+            AT_1_KHZ_BY_50 | UNCHECKED,
+            rig=folder / "rig.toml",
+            cycles=15,
+            measured_cycles=None,
+            acceleration_g=0.05,
+            directions=["forward"],
+        )
+    )
     play_unpaced(read_run_config(profile), "first", log, lambda: None, lambda item: None)
     return log
 

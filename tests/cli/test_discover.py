@@ -1,5 +1,6 @@
 """Recordings that nothing should be learned from, and what a user is told of them."""
 
+import math
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ import pytest
 from table_io.block import Float1D
 from table_io.errors import InputError
 from table_io.records import SampleGap
+from tests.builders.profiles import AT_1_KHZ_BY_50, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT, read_model_text
 from tests.builders.truths import hide_truth
 from tests.input_errors import raises_input_error
@@ -30,27 +32,7 @@ from twin.setup.run_config import read_model_template, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.system.exit_codes import EXIT_INTERRUPTED
 
-PROFILE = """
-title = "short"
-rig = "{rig}"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = 2.8
-stop_hz = 4.4
-step_hz = 0.8
-cycles = 4
-[acquisition]
-rate_hz = 1000.0
-block_samples = 50
-[loop_check]
-enabled = false
-[control]
-enabled = false
-[protection]
-sensor = "warn"
-"""
+TABLES = AT_1_KHZ_BY_50 | UNCHECKED | {"protection": {"sensor": "warn"}}
 NOTHING_NAMED = [effect.id for effect in EFFECTS]  # left out: the verdict is quick
 
 
@@ -63,7 +45,7 @@ class Made:
 
 
 def record_run(
-    folder: Path, truth: str = "", gap: str = "4.0", laser_range_mm: float = 100.0
+    folder: Path, truth: str = "", gap_mm: float = 4.0, laser_range_mm: float = 100.0
 ) -> Made:
     folder.mkdir()
     laser = 'channel = "mass_disp_m"\nunit = "mm"\nrange = '
@@ -71,7 +53,7 @@ def record_run(
     rig = folder / "rig.toml"
     rig.write_text(hide_truth(text, folder, truth))
     profile, log = folder / "p.toml", folder / f"{folder.name}.mcap"
-    profile.write_text(PROFILE.format(rig=rig, gap=gap))
+    profile.write_text(format_test(2.8, 4.4, 0.8, gap_mm, TABLES, rig=rig, measured_cycles=None))
     play_unpaced(read_run_config(profile), folder.name, log, lambda: None, lambda item: None)
     return Made(log, profile)
 
@@ -176,7 +158,7 @@ def test_samples_beyond_the_range_of_a_sensor_are_not_used(plain: Made, tmp_path
 
 def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:
     truth = "[base]\ngap_right_m = 0.002\ngap_left_m = 0.002\n"
-    _, notes = load_logs([record_run(tmp_path / "touching", truth, "inf").log])
+    _, notes = load_logs([record_run(tmp_path / "touching", truth, math.inf).log])
     assert sum("no right bumper" in text for text in notes) == 2
     assert sum("no left bumper" in text for text in notes) == 2
 
@@ -233,7 +215,7 @@ def test_motion_alone_says_nothing_of_forces(plain: Made, tmp_path: Path) -> Non
 
 
 def test_a_fault_of_a_sensor_is_no_candidate_for_a_force(tmp_path: Path) -> None:
-    (log,), _ = load_logs([record_run(tmp_path / "flight", gap="inf").log])
+    (log,), _ = load_logs([record_run(tmp_path / "flight", gap_mm=math.inf).log])
     library = prepare_problem([log], read_model_template("snm")[0]).problem.library
     names = {candidate.name for candidate in library}
     assert "cubic_stiffness" in names

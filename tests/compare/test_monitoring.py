@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -26,6 +26,7 @@ from table_io.records import (
     Record,
     Step,
 )
+from tests.builders.profiles import AT_1_KHZ, NO_LOOP_CHECK, format_test
 from tests.builders.rigs import RIG_TEXT, read_model_text
 from tests.builders.truths import hide_truth
 from twin.compare import COMPARED_CHANNELS, pipeline
@@ -48,22 +49,7 @@ from twin.setup.unpaced import iter_simulated_session
 from twin.transport.codec import encode_item
 
 # Slow enough for many cycles of contact, short enough for a test; no loop check, no tuning.
-PROFILE = """
-title = "Through the resonance and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 0.5
-cycles = 8
-measured_cycles = 4
-[acquisition]
-rate_hz = 1000.0
-[loop_check]
-enabled = false
-"""
+SWEEP = partial(format_test, 2.4, 4.4, tables=AT_1_KHZ | NO_LOOP_CHECK, cycles=8, measured_cycles=4)
 EFFECT = '[[effects]]\nid = "{}"\n{}\nparameters = {{ {} }}\n'
 STIFFNESS, GAP = 36e3, 2e-3
 STEP_HZ = 0.1  # of the sweeps of points
@@ -74,7 +60,7 @@ def session(truth: str = "", gap: float = 4.0) -> tuple[RunConfig, Block]:
     """(the bundle that a person knows of, every measured sample of the rig with that truth)."""
     with TemporaryDirectory() as folder:
         rig = hide_truth(RIG_TEXT, Path(folder), truth)
-        bundle = from_texts("x", PROFILE.format(gap=gap), rig, read_model_text("snm"), "x")
+        bundle = from_texts("x", SWEEP(0.5, float(gap)), rig, read_model_text("snm"), "x")
         items = iter_simulated_session(bundle, "r")
         return bundle, join_blocks([item for item in items if isinstance(item, Block)])
 
@@ -216,7 +202,7 @@ def test_warnings_are_of_the_kinds_that_a_replay_says_anew() -> None:
 def make_bundle(sweep_keys: str, model: str = "", step_hz: float = 0.1) -> RunConfig:
     """The test at 4 mm with further keys of its sweep, and effects appended to the model."""
     rig, snm = (PROFILES_DIR / name for name in ("rigs/simulated.toml", "models/snm.toml"))
-    text = PROFILE.format(gap=4.0).replace("step_hz = 0.5", f"step_hz = {step_hz}\n{sweep_keys}")
+    text = SWEEP(0.5).replace("step_hz = 0.5", f"step_hz = {step_hz}\n{sweep_keys}")
     return from_texts("x", text, rig.read_text(), f"{snm.read_text()}\n{model}", "x")
 
 

@@ -27,25 +27,13 @@ from table_io.records import (
     StepAdded,
 )
 from tests.builders.blocks import recut_blocks
+from tests.builders.profiles import AT_1_KHZ, format_test
 from twin.compare import pipeline
 from twin.compare.monitoring.jumps import ExpectedJump
 from twin.setup.run_config import RunConfig, from_texts
 from twin.transport.codec import Item, encode_item
 
-PROFILE = """
-title = "Two frequencies on either side of the down-jump, up and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.0
-stop_hz = 4.6
-step_hz = 1.6
-cycles = 5
-measured_cycles = 2
-[acquisition]
-rate_hz = 1000.0
-"""
+PROFILE = format_test(3.0, 4.6, 1.6, cycles=5, tables=AT_1_KHZ)
 
 
 @pytest.fixture(scope="module")

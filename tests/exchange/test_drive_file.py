@@ -13,6 +13,7 @@ from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.block import Float1D
 from table_io.config.folders import find_config
 from table_io.sim.machine.table import read_drive
+from tests.builders.profiles import format_test
 from tests.input_errors import raises_input_error
 from twin.exchange.drive_file import (
     WRITERS,
@@ -24,19 +25,7 @@ from twin.exchange.drive_file import (
 from twin.rig.table import ExternalController, serve_table
 from twin.setup.run_config import read_run_config
 
-PROFILE = """
-title = "short"
-rig = "follow_simulated"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 2.6
-step_hz = 0.2
-cycles = 3
-measured_cycles = 2
-"""
+PROFILE = format_test(2.4, 2.6, 0.2, rig="follow_simulated", cycles=3)
 
 
 @pytest.fixture(scope="module")

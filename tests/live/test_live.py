@@ -16,24 +16,13 @@ import pytest
 
 from table_io.records import Comparison, Fault
 from tests.builders.ports import free_endpoint
+from tests.builders.profiles import format_test
 from tests.command_line import call_main
 from twin.recording.reader import Recording, read_recording
 from twin.system.diagnostics import LEVEL_VARIABLE
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
-PROFILE = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.6
-stop_hz = 4.0
-step_hz = 0.2
-cycles = 5
-measured_cycles = 2
-directions = ["forward"]
-"""
+PROFILE = format_test(3.6, 4.0, 0.2, cycles=5, directions=["forward"])
 QUICK = f"{PROFILE}[loop_check]\nenabled = false\n"  # the processes are the same, 15 s sooner
 
 

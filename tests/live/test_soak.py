@@ -25,6 +25,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.units import GRAVITY_M_S2
 from tests.builders.flight_records import RecordedSession, read_flight_record
+from tests.builders.profiles import UNCHECKED, format_test
 from tests.builders.rigs import read_rig_text
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
@@ -34,22 +35,6 @@ A = 0.05 * GRAVITY_M_S2
 PEAK_RATIO = 1.06  # of the level: a decay multiplies a blend that may itself be at 1.05
 UPDATE = 10 ** (2.0 / 20)  # most that an amplitude update changes, maybe one not yet reported
 STILL_M = 2e-4  # that a table at rest still moves, with a mass that swings on it
-TEST = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.0
-stop_hz = 4.0
-step_hz = 0.5
-cycles = 4
-measured_cycles = 2
-[loop_check]
-enabled = {check}
-[control]
-enabled = {check}
-"""
 CLOSED, SILENT = "the connection closed", "no message from the controller"
 # Each is done to the rig at a random time of its test, and the machine sees one of these. A process
 # that dies on a busy computer may be silent for longer than its connection stays open.
@@ -115,7 +100,9 @@ class Group:
         if self.fault:
             text += f"\n[[simulated.faults]]\nat_s = 2.5\n{self.fault}\n"
         (self.folder / "card.toml").write_text(text)
-        (self.folder / "test.toml").write_text(TEST.format(check=str(self.check).lower()))
+        (self.folder / "test.toml").write_text(
+            format_test(2.0, 4.0, 0.5, tables={} if self.check else UNCHECKED)
+        )
         command: list[str | Path] = [SHAKETWIN, "table", "--rig", self.folder / "card.toml"]
         command += ["--log", self.folder / "box", "--time-scale", str(self.pace)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as machine:

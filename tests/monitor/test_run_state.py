@@ -26,6 +26,7 @@ from table_io.records import (
     Trip,
 )
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
+from tests.builders.profiles import AT_1_KHZ, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.monitor.monitored import (
     LEVEL,
@@ -265,21 +266,7 @@ def test_points_are_kept_by_step() -> None:
     assert all(isinstance(point, PrcPoint) for point in state.points.values())
 
 
-SHORT_SWEEP = """
-title = "Two frequencies"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.0
-stop_hz = 2.5
-step_hz = 0.5
-cycles = 4
-measured_cycles = 2
-directions = ["forward"]
-[acquisition]
-rate_hz = 1000.0
-"""
+SHORT_SWEEP = format_test(2.0, 2.5, 0.5, directions=["forward"], tables=AT_1_KHZ)
 
 
 def start_sweep() -> tuple[RunStart, Drive]:

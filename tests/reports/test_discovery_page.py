@@ -10,6 +10,7 @@ import pytest
 from matplotlib.image import imread
 
 from table_io.config.base import parse_toml
+from tests.builders.profiles import AT_1_KHZ_BY_50, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import hide_truth
 from tests.reports.folders import draw_in_full_quality
@@ -36,25 +37,6 @@ from twin.setup.run_config import list_model_warnings, read_model_template, read
 from twin.setup.unpaced import play_unpaced
 
 HARDENING_N_M2 = 4.0e7  # N/m2
-SHORT = """
-title = "G4, a few steps"
-rig = "{rig}"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.8
-stop_hz = 4.4
-step_hz = 0.4
-cycles = 4
-[acquisition]
-rate_hz = 1000.0
-block_samples = 50
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
 AWAY = (
     "sensor_gain", "sensor_lag", "sensor_offset", "table_tilt", "bumper_maxwell", "hunt_crossley",
     "mass_error", "maxwell_damper", "bouc_wen", "adhesion", "appendage", "dead_band", "gap_drift",
@@ -87,7 +69,11 @@ def record_run(folder: Path) -> Path:
     card = folder / "rig.toml"
     text = f'[[effects]]\nid = "bumper_hardening"\nparameters = {{ k2 = {HARDENING_N_M2} }}\n'
     card.write_text(hide_truth(RIG_TEXT, folder, text))
-    (folder / "p.toml").write_text(SHORT.format(rig=card))
+    (folder / "p.toml").write_text(
+        format_test(
+            2.8, 4.4, 0.4, tables=AT_1_KHZ_BY_50 | UNCHECKED, rig=card, measured_cycles=None
+        )
+    )
     log = folder / "hard.mcap"
     play_unpaced(read_run_config(folder / "p.toml"), "hard", log, lambda: None, lambda item: None)
     return log

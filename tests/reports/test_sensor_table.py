@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.records import Event, RunStart
+from tests.builders.profiles import NO_LOOP_CHECK, format_test
 from tests.builders.rigs import RIG_TEXT
 from twin.cli.table import app
 from twin.recording.reader import read_recording
@@ -38,21 +39,7 @@ departure_percent = 0.1
 tolerance_percent = 1.0
 passed = true
 """
-SHORT = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.4
-stop_hz = 3.4
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-directions = ["forward"]
-[loop_check]
-enabled = false
-"""
+SHORT = format_test(3.4, 3.4, 0.2, directions=["forward"], tables=NO_LOOP_CHECK)
 
 
 def start(rig_toml: str = CARD, started_at: str = "2026-03-11T10:00:00+00:00") -> RunStart:

@@ -25,6 +25,7 @@ from table_io.records import (
     Timing,
 )
 from tests.builders.blocks import drop_measured
+from tests.builders.profiles import AT_1_KHZ, format_test
 from twin.compare import COMPARED_CHANNELS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
@@ -35,22 +36,7 @@ from twin.setup.run_config import RunConfig, read_run_config
 from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import Item
 
-PROFILE = """
-title = "Two frequencies, up and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.6
-stop_hz = 4.4
-step_hz = 1.8
-cycles = 4
-measured_cycles = 2
-[acquisition]
-rate_hz = 1000.0
-[recording]
-predictions = "all"
-"""
+PROFILE = format_test(2.6, 4.4, 1.8, tables=AT_1_KHZ | {"recording": {"predictions": "all"}})
 CELLS = ("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")
 
 

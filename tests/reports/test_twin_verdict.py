@@ -13,6 +13,7 @@ import pytest
 from table_io.block import Block
 from table_io.config.base import format_toml
 from table_io.records import NormalizedResponse, PrcPoint
+from tests.builders.profiles import AT_1_KHZ, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import seal_truth
 from twin.compare.monitoring.cycle import ChannelNoise
@@ -30,32 +31,11 @@ from twin.setup.run_config import read_run_config
 from twin.setup.unpaced import play_unpaced
 
 Json = dict[str, Any]
-TEST = """
-title = "{name}"
-rig = "{rig}"
-[specimen]
-mass_kg = 550.0
-gap_mm = {gap}
-[sweep]
-start_hz = {start}
-stop_hz = {stop}
-step_hz = {step}
-cycles = 4
-measured_cycles = 2
-[acquisition]
-rate_hz = 1000.0
-[protection]
-sensor = "warn"
-alarm = 0.2
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
+TABLES = AT_1_KHZ | UNCHECKED | {"protection": {"sensor": "warn", "alarm": 0.2}}
 FRICTION = '[[effects]]\nid = "coulomb_friction"\nparameters = { fc = 50.0 }\n'
 STIFF_BUMPERS = "[base]\nbumper_stiffness_n_m = 700e3\n"
-IMPACTS = {"gap": 4.0, "start": 2.4, "stop": 4.4, "step": 0.4}
-PRECOMPRESSED = {"gap": -2.0, "start": 4.0, "stop": 8.0, "step": 1.0}
+IMPACTS = {"gap_mm": 4.0, "start_hz": 2.4, "stop_hz": 4.4, "step_hz": 0.4}
+PRECOMPRESSED = {"gap_mm": -2.0, "start_hz": 4.0, "stop_hz": 8.0, "step_hz": 1.0}
 
 
 def run_test(
@@ -72,7 +52,7 @@ def run_test(
     ]
     rig |= {"simulated": simulated, "sensors": sensors}
     (folder / "rig.toml").write_text(format_toml(rig))
-    (folder / "test.toml").write_text(TEST.format(name="test", rig=folder / "rig.toml", **sweep))
+    (folder / "test.toml").write_text(format_test(**sweep, tables=TABLES, rig=folder / "rig.toml"))
     config = read_run_config(folder / "test.toml")
     play_unpaced(config, "test", folder / "run.mcap", lambda: None, lambda _: None)
     recording = read_recording(folder / "run.mcap")

@@ -10,6 +10,7 @@ import pytest
 
 from table_io.records import Event
 from tests.builders.ports import free_port
+from tests.builders.profiles import NO_LOOP_CHECK, format_test
 from tests.live.test_live import SHAKETWIN, running
 from tests.security.laboratory import (
     answers,
@@ -23,21 +24,7 @@ from twin.security.credentials import read_credentials
 from twin.transport.endpoint import MAX_SESSIONS_PER_PERSON, PUBLIC_HUB_SETTINGS
 
 PATIENCE_S = 20.0
-PROFILE = """
-title = "Crowded"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.6
-stop_hz = 4.0
-step_hz = 0.2
-cycles = 1000
-measured_cycles = 2
-directions = ["forward"]
-[loop_check]
-enabled = false
-"""
+PROFILE = format_test(3.6, 4.0, 0.2, cycles=1000, directions=["forward"], tables=NO_LOOP_CHECK)
 FILL = """
 import sys, time
 from contextlib import suppress

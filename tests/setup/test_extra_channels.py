@@ -12,6 +12,7 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.formats import read_table
 from table_io.records import Comparison
+from tests.builders.profiles import AT_1_KHZ, format_test
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.input_errors import raises_input_error
 from tests.viewer.example_run import scalars
@@ -28,24 +29,14 @@ from twin.rig.predicted_ranges import predict_response
 from twin.setup.run_config import read_run_config
 from twin.transport.codec import Item
 
-PROFILE = """
-title = "Three steps upwards"
-rig = "lab"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.0
-stop_hz = 3.0
-step_hz = 0.5
-cycles = 4
-measured_cycles = 2
-directions = ["forward"]
-[acquisition]
-rate_hz = 1000.0
-[protection]
-sensor = "warn"
-"""
+PROFILE = format_test(
+    2.0,
+    3.0,
+    0.5,
+    rig="lab",
+    directions=["forward"],
+    tables=AT_1_KHZ | {"protection": {"sensor": "warn"}},
+)
 
 
 def shaketwin(*arguments: str | Path, code: int = 0) -> str:

@@ -9,6 +9,7 @@ import pytest
 from table_io.block import Block, join_blocks
 from table_io.errors import InputError
 from table_io.records import Event
+from tests.builders.profiles import NO_LOOP_CHECK, format_test
 from twin.model.config import load_model_config
 from twin.model.model import Model
 from twin.model.prepare import prepare_solver
@@ -18,25 +19,6 @@ from twin.setup.run_config import read_model, read_run_config
 from twin.setup.unpaced import play_unpaced, simulate_ideal
 from twin.transport.codec import Item
 
-PROFILE = """
-title = "two frequencies"
-model = "{model}"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[acquisition]
-rate_hz = 1000.0
-block_samples = {block}
-[loop_check]
-enabled = false
-[sweep]
-start_hz = 2.8
-stop_hz = 3.0
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-acceleration_g = 0.05
-"""
 LAW = """
 id = "own"
 force = "{force}"
@@ -62,7 +44,16 @@ def write_model(folder: Path, force: str, values: str) -> Path:
 
 def write_profile(folder: Path, model: Path | str, block: int = 50) -> Path:
     path = folder / "test.toml"
-    path.write_text(PROFILE.format(model=model, block=block))
+    path.write_text(
+        format_test(
+            2.8,
+            3.0,
+            0.2,
+            model=model,
+            acceleration_g=0.05,
+            tables=NO_LOOP_CHECK | {"acquisition": {"rate_hz": 1000.0, "block_samples": block}},
+        )
+    )
     return path
 
 

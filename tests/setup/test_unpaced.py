@@ -19,6 +19,7 @@ from table_io.records import (
     RunStop,
     SampleGap,
 )
+from tests.builders.profiles import UNCHECKED, format_test
 from tests.input_errors import raises_input_error
 from twin.compare.twins import HISTORY_S
 from twin.recording.reader import Recording, read_recording
@@ -30,24 +31,9 @@ from twin.transport.codec import Item
 
 LEVEL = 0.05 * 9.80665
 GRID = [2.6, 2.8, 3.0, 3.2, 3.4, 3.6, 3.8, 4.0, 4.2, 4.4]
-QUICK = """
-title = "G4 through its primary resonance, up and back"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.6
-stop_hz = 4.4
-step_hz = 0.2
-cycles = 6
-measured_cycles = 2
-[loop_check]
-enabled = false
-[control]
-enabled = false
-[recording]
-predictions = "all"
-"""
+QUICK = format_test(
+    2.6, 4.4, 0.2, cycles=6, tables=UNCHECKED | {"recording": {"predictions": "all"}}
+)
 
 
 def play_run(

@@ -8,6 +8,7 @@ import pytest
 
 from table_io.config.base import PROFILES_DIR
 from table_io.records import Comparison, Event, Fault, PrcPoint, StepAdded
+from tests.builders.profiles import AT_1_KHZ, NO_LOOP_CHECK, format_test
 from tests.builders.recordings import store_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.pipeline_replay import RecordedRun, replay_recording
@@ -18,25 +19,14 @@ from twin.setup.run_config import RunConfig, from_texts
 from twin.setup.unpaced import play_unpaced
 from twin.transport.codec import encode_item
 
-PROFILE = """
-title = "Two frequencies, and a dwell at the second"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.8
-stop_hz = 4.0
-step_hz = 0.2
-cycles = 3
-measured_cycles = 2
-directions = ["forward"]
-[dwell]
-cycles = 6
-[loop_check]
-enabled = false
-[acquisition]
-rate_hz = 1000.0
-"""
+PROFILE = format_test(
+    3.8,
+    4.0,
+    0.2,
+    cycles=3,
+    directions=["forward"],
+    tables=NO_LOOP_CHECK | AT_1_KHZ | {"dwell": {"cycles": 6}},
+)
 
 
 @pytest.fixture(scope="module")

@@ -28,6 +28,7 @@ from tempfile import TemporaryDirectory
 import pytest
 from typer.main import get_command
 
+from tests.builders.profiles import format_test
 from tests.exchange.csv_tables import write_csv
 from tests.recording import mutants
 
@@ -37,18 +38,7 @@ HANGS_S = 60.0  # of computing for one mutant
 SILENT_S = 600.0  # of the clock, which others may slow
 REPORT_INTERVAL = 50  # one in so many replays makes its report too
 EXPORT_FORMATS = ("--csv", "--parquet", "--mat", "--foxglove")
-PROFILE = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.4
-stop_hz = 3.6
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-"""
+PROFILE = format_test(3.4, 3.6, 0.2)
 
 
 class Trials:

@@ -17,6 +17,7 @@ import numpy as np
 from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import Event
+from tests.builders.profiles import NO_LOOP_CHECK, format_test
 from twin.model.config import load_model_config
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
@@ -27,26 +28,13 @@ from twin.setup.run_config import RunConfig, from_texts, read_run_config
 from twin.setup.unpaced import play_unpaced
 
 MAX_LAW_S = 30
-PROFILE = """
-title = "short test"
-rig = "simulated"
-model = "snm"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.8
-stop_hz = 3.2
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-acceleration_g = 0.05
-[acquisition]
-rate_hz = 1000.0
-block_samples = 20
-[loop_check]
-enabled = false
-"""
+PROFILE = format_test(
+    2.8,
+    3.2,
+    0.2,
+    acceleration_g=0.05,
+    tables=NO_LOOP_CHECK | {"acquisition": {"rate_hz": 1000.0, "block_samples": 20}},
+)
 BASE = """
 title = "with a random law"
 [base]

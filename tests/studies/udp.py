@@ -31,6 +31,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.records import Event
 from tests.builders.flight_records import read_flight_record
+from tests.builders.profiles import UNCHECKED, format_test
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     card,
@@ -45,22 +46,7 @@ RATE_HZ = 2000.0
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
 DECISIONS, KILLS = 400, 10
 STILL_M = 2e-4
-TEST = """
-title = "Short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 1.0
-stop_hz = 3.0
-step_hz = 0.5
-cycles = 4
-measured_cycles = 2
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
+TEST = format_test(1.0, 3.0, 0.5, tables=UNCHECKED)
 
 
 def latency(folder: Path) -> None:

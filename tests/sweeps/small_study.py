@@ -2,22 +2,13 @@
 
 from pathlib import Path
 
+from tests.builders.profiles import format_test
 from twin.studies.maps.cases import sample_parameters
 from twin.studies.maps.store import Manifest, create_store
 from twin.studies.maps.study import Study
 from twin.studies.maps.task import compute_chunk, make_sweep_plan
 
-TEST = """
-title = "Across the jumps of G4"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 0.2
-cycles = 8
-"""
+TEST = format_test(2.4, 4.4, 0.2, cycles=8, measured_cycles=None)
 STUDY = """
 title = "Gap and stiffness"
 profile = "{profile}"

@@ -2,6 +2,7 @@
 
 import json
 
+from tests.builders.profiles import format_test
 from twin.dynamics.period_map import set_total_gap
 from twin.model.model import Model
 from twin.model.parameters import Parameters
@@ -11,18 +12,7 @@ from twin.studies.batch import Batch, read_batch, simulate_case
 
 AG = 0.05 * 9.80665
 G4 = Parameters(550.0, 36e3, 1100.0, 510e3, 900.0, 510e3, 900.0, 2e-3, 2e-3)
-TEST = """
-title = "Two steps"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.0
-stop_hz = 3.2
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-"""
+TEST = format_test(3.0, 3.2, 0.2)
 
 
 def test_a_gap_is_shared_by_both_sides() -> None:

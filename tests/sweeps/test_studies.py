@@ -18,6 +18,7 @@ from matplotlib.figure import Figure
 
 from table_io.config.base import load_config
 from table_io.config.profile import Profile
+from tests.builders.profiles import format_test
 from tests.input_errors import raises_input_error
 from twin.inspection.folder_report import write_folder_report
 from twin.laws.effect import Effect, EffectParameter
@@ -33,18 +34,7 @@ from twin.system.exit_codes import EXIT_INTERRUPTED
 pytestmark = pytest.mark.usefixtures("forget_entry_points")
 
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
-TEST = """
-title = "Through the resonance"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 4.4
-step_hz = 0.2
-cycles = 5
-measured_cycles = 2
-"""
+TEST = format_test(2.4, 4.4, 0.2, cycles=5)
 EFFECT = '[[effects]]\nid = "{}"\nparameters = {{ {} }}\n'
 HARDENING = EFFECT.format("bumper_hardening", "k2 = 6e7")
 

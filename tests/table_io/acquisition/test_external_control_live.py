@@ -11,6 +11,7 @@ import pytest
 
 from table_io.config.folders import find_config
 from table_io.records import Event
+from tests.builders.profiles import NO_LOOP_CHECK, format_test
 from tests.input_errors import raises_input_error
 from tests.table_io.backends.separate_processes import own_network
 from twin.recording.reader import read_recording
@@ -18,21 +19,7 @@ from twin.rig.table import ExternalController, serve_table
 
 pytest.importorskip("opendaq")
 PROGRAM = Path(sys.executable).parent / "shaketwin"
-PROFILE = """
-title = "short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 3.0
-stop_hz = 3.2
-step_hz = 0.2
-cycles = 4
-measured_cycles = 2
-directions = ["forward"]
-[loop_check]
-enabled = false
-"""
+PROFILE = format_test(3.0, 3.2, 0.2, directions=["forward"], tables=NO_LOOP_CHECK)
 FOLLOWED = ("--table", "follow_simulated")
 
 

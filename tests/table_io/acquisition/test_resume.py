@@ -13,20 +13,10 @@ from table_io.excitation.trajectory import plan_sweep
 from table_io.safety.preflight import compute_demands
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from tests.builders.drives import sine_segment_at, sine_segments
+from tests.builders.profiles import format_test
 from tests.builders.rigs import RIG
 
-TEXT = """
-title = "short"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.0
-stop_hz = 4.0
-step_hz = 1.0
-cycles = 4
-measured_cycles = 2
-"""
+TEXT = format_test(2.0, 4.0, 1.0)
 
 
 def profile(first: int | None = None, **more: Any) -> Profile:

@@ -21,6 +21,7 @@ from table_io.config.rig import BACKEND_GROUP, RigConfig, load_backend
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from table_io.sim.machine.table import SIMULATOR_GROUP, find_simulator
+from tests.builders.profiles import format_test
 from tests.builders.rigs import read_rig_text
 from tests.command_line import call_main
 from tests.input_errors import raises_input_error
@@ -34,18 +35,7 @@ MODULE, PROJECT = (
 UDP_RIG = read_rig_text("udp_example")
 RIG = re.sub(r"\[udp\].*?(?=\[limits\])", "[ideal]\ngain = 1.0\n\n", UDP_RIG, flags=re.DOTALL)
 RIG = RIG.replace('"udp"', '"ideal"').replace("udp_example", "ideal")
-PROFILE = """
-title = "Two steps"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[sweep]
-start_hz = 2.4
-stop_hz = 2.8
-step_hz = 0.4
-cycles = 5
-measured_cycles = 2
-"""
+PROFILE = format_test(2.4, 2.8, 0.4, cycles=5)
 ACQUIRES = """
 from table_io.backends import BackendDescriptor
 from table_io.config.rig import BackendConfig

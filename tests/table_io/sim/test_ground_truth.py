@@ -22,7 +22,7 @@ from table_io.sim.ground_truth import (
     parse_ground_truth,
 )
 from table_io.sim.simulated_table import SensorDistortion, SimulatedBackend
-from tests.builders.profiles import SPECIMEN
+from tests.builders.profiles import AT_1_KHZ, SPECIMEN, UNCHECKED, format_test
 from tests.builders.truths import seal_truth
 from tests.input_errors import raises_input_error
 from twin.laws.library import EFFECTS
@@ -245,27 +245,6 @@ def test_damper_force_is_that_of_the_damper_alone(tmp_path: Path) -> None:
     assert np.median(np.abs(force - expected)) < 1.0
 
 
-QUICK = """
-title = "Two steps"
-rig = "{rig}"
-[specimen]
-mass_kg = 550.0
-gap_mm = 4.0
-[acquisition]
-rate_hz = 1000.0
-[sweep]
-start_hz = 3.2
-stop_hz = 3.4
-step_hz = 0.2
-cycles = 3
-measured_cycles = 1
-[loop_check]
-enabled = false
-[control]
-enabled = false
-"""
-
-
 def spell_number(number: float) -> Iterator[bytes]:
     """How a number could stand in a recording."""
     yield from (form.encode() for form in {str(number), repr(number), f"{number:g}"})
@@ -277,7 +256,11 @@ def test_recording_holds_the_hash_and_nothing_else_of_the_truth(tmp_path: Path) 
     card = tmp_path / "card.toml"
     card.write_text(CARD_TOML + "".join(f'{key} = "{value}"\n' for key, value in keys.items()))
     profile = tmp_path / "quick.toml"
-    profile.write_text(QUICK.format(rig=card))
+    profile.write_text(
+        format_test(
+            3.2, 3.4, 0.2, tables=AT_1_KHZ | UNCHECKED, rig=card, cycles=3, measured_cycles=1
+        )
+    )
     bundle = read_run_config(profile)
     play_unpaced(bundle, "quick", tmp_path / "run.mcap", lambda: None, lambda item: None)
     Path(keys["truth"]).unlink()
