@@ -7,6 +7,7 @@ from io import StringIO
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
 from twin.cli import table as cli
 
@@ -23,3 +24,11 @@ def call_main(*words: object, cwd: Path | None = None) -> subprocess.CompletedPr
             cli.main()
     assert isinstance(ended.value.code, int)
     return subprocess.CompletedProcess(argv, ended.value.code, out.getvalue(), err.getvalue())
+
+
+def invoke(*words: object) -> tuple[int, str]:
+    """Return (exit code, output) of `shaketwin` with these words; what is refused is raised."""
+    result = CliRunner().invoke(cli.app, [*map(str, words)])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result.exit_code, result.stdout

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from table_io.backends import MachineLost
 from table_io.block import Float1D, Float2D
@@ -22,8 +21,8 @@ from table_io.config.sensor import CalibrationRecord
 from table_io.errors import InputError
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.rigs import RIG_TEXT
+from tests.command_line import invoke
 from tests.input_errors import raises_input_error
-from twin.cli.table import app
 from twin.rig import calibrate as command
 from twin.setup.run_config import read_run_config
 
@@ -74,10 +73,7 @@ def calibrate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calib
     monkeypatch.setattr(builtins, "input", person)
 
     def run(*words: str, channel: str = "table_disp_m") -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["calibrate", channel, "--table", "mine.toml", *words])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result.exit_code, result.stdout
+        return invoke("calibrate", channel, "--table", "mine.toml", *words)
 
     yield run
     Applied.mm, Applied.gone = 0.0, False

@@ -6,11 +6,11 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from table_io.backends import MachineLost
 from table_io.block import Float1D, Float2D
@@ -21,8 +21,8 @@ from table_io.config.rig import RigConfig
 from table_io.sim.simulated_table import SimulatedBackend
 from tests.builders.flight_records import read_flight_record
 from tests.builders.rigs import RIG_TEXT, read_rig_text
+from tests.command_line import invoke
 from tests.input_errors import raises_input_error
-from twin.cli.table import app
 from twin.rig.check_table import WiringCheckResult, examine_wiring
 
 RIG = parse_toml(RIG_TEXT, RigConfig, "simulated")
@@ -320,41 +320,31 @@ def test_a_shunt_proves_the_gain() -> None:
     assert failing(run_shunt_check(-2.0)) == [("shunt", "force_r1_n")]
 
 
-Invoke = Callable[..., tuple[int, str]]
-
-
 @pytest.fixture
-def invoke(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Invoke:
+def check(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str]]:
     monkeypatch.chdir(tmp_path)
-
-    def run(*words: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["check", *words])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result.exit_code, result.stdout
-
-    return run
+    return partial(invoke, "check")
 
 
 def test_the_command_says_it_in_a_table_and_ends_with_2_where_a_line_fails(
-    invoke: Invoke, tmp_path: Path
+    check: Callable[..., tuple[int, str]], tmp_path: Path
 ) -> None:
-    code, text = invoke("--table", "simulated")
+    code, text = check("--table", "simulated")
     assert code == 0
     assert "no line fails" in text
     assert text.rstrip().endswith("nothing was moved")
     fault = '\n[[simulated.faults]]\nkind = "cable_off"\nchannel = "mass_disp_m"\nat_s = 0.0\n'
     due = RIG_TEXT.replace('channel = "force_l2_n"', 'channel = "force_l2_n"\ndue = 2020-01-01')
     (tmp_path / "card.toml").write_text(due + fault)
-    code, text = invoke("--table", "card.toml")
+    code, text = check("--table", "card.toml")
     assert code == 2
     assert "FAIL noise, mass_disp_m: " in text
     assert "warning: force_l2_n: its calibration was due on 2020-01-01" in text
     assert "no line fails" not in text
 
 
-def test_as_json_every_line_stands_there(invoke: Invoke) -> None:
-    code, text = invoke("--table", "simulated", "--json")
+def test_as_json_every_line_stands_there(check: Callable[..., tuple[int, str]]) -> None:
+    code, text = check("--table", "simulated", "--json")
     report = json.loads(text)
     assert (code, report["passed"], report["backend"]) == (0, True, "simulated")
     assert {line["channel"] for line in report["lines"]} == {*RIG.channels, ""}
@@ -364,14 +354,14 @@ def test_as_json_every_line_stands_there(invoke: Invoke) -> None:
     assert acc["mean"] == pytest.approx(0.001, abs=1e-4)
 
 
-def test_what_is_asked_for_must_fit(invoke: Invoke) -> None:
+def test_what_is_asked_for_must_fit(check: Callable[..., tuple[int, str]]) -> None:
     quick = str(PROFILES_DIR / "tests" / "quickstart.toml")
     for words in ((), ("--json",), (quick, "--json"), (quick, "--unattended")):
         with raises_input_error(where="check", allowed="PROFILE"):
-            invoke(*words)
+            check(*words)
     with raises_input_error(where="--table simulatd", remedy="'simulated'"):
-        invoke("--table", "simulatd")
-    assert "ready: nothing exceeds" in invoke(quick)[1]  # the pre-flight is what it was
+        check("--table", "simulatd")
+    assert "ready: nothing exceeds" in check(quick)[1]  # the pre-flight is what it was
 
 
 def test_a_loss_is_no_traceback() -> None:

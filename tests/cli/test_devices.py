@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent import futures
+from functools import partial
 from pathlib import Path
 
 import grpc
@@ -14,7 +15,6 @@ from nidaqmx._stubs import nidaqmx_pb2 as pb
 from nidaqmx._stubs import nidaqmx_pb2_grpc as rpc
 from nidaqmx.errors import DaqNotFoundError
 from nidaqmx.system import System
-from typer.testing import CliRunner
 
 from table_io.backends import ChannelGroup, DiscoveredDevice
 from table_io.backends.ni import driver as ni_found
@@ -23,8 +23,8 @@ from table_io.backends.opendaq.source import discover_devices as discover_openda
 from table_io.config import folders
 from table_io.errors import InputError
 from tests.builders.rigs import read_rig_text
+from tests.command_line import invoke
 from tests.input_errors import raises_input_error
-from twin.cli.table import app
 from twin.rig import devices as command
 
 MACHINE = read_rig_text("machine")
@@ -46,13 +46,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(daq_found, "discover_devices", lambda addresses: (LASER,))
 
-    def invoke(*words: str) -> tuple[int, str]:
-        result = CliRunner().invoke(app, ["devices", *words])
-        if result.exception is not None and not isinstance(result.exception, SystemExit):
-            raise result.exception
-        return result.exit_code, result.stdout
-
-    return invoke
+    return partial(invoke, "devices")
 
 
 def cards(text: str) -> dict[str, dict[str, object]]:

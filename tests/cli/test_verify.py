@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from table_io.acquisition.session import run_session
 from table_io.backends import open_backend
@@ -21,9 +20,9 @@ from table_io.clock import ManualClock
 from table_io.errors import InputError
 from table_io.records import RunStart, RunStop, SampleGap
 from tests.cli.test_cli import SHORT
+from tests.command_line import invoke
 from tests.input_errors import raises_input_error
 from tests.recording.mutants import damage, spans, whole
-from twin.cli.table import app
 from twin.recording.mcap_log import LogWriter, write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.recovery import ATTACHMENT, CHUNK, recover_log
@@ -61,15 +60,13 @@ def log(recording: Recording, tmp_path: Path) -> Path:
 
 def verify(*words: object) -> tuple[int, dict[str, Any]]:
     """(exit code, what it says as JSON)."""
-    result = CliRunner().invoke(app, ["verify", *map(str, words), "--json"])
-    if result.exception is not None and not isinstance(result.exception, SystemExit):
-        raise result.exception
-    return result.exit_code, json.loads(result.stdout)
+    code, text = invoke("verify", *words, "--json")
+    return code, json.loads(text)
 
 
 def read_output(*words: object) -> str:
     """What it says to people."""
-    return CliRunner().invoke(app, ["verify", *map(str, words)]).stdout
+    return invoke("verify", *words)[1]
 
 
 def chunk(path: Path, number: int) -> tuple[int, int]:

@@ -1,16 +1,13 @@
 """`verify` of a test that has no end, of one that was repaired, and of parts not yet together."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import pytest
-from typer.testing import CliRunner
 
 from table_io.errors import InputError
 from table_io.records import RunStop, SampleGap
+from tests.cli.test_verify import read_output, verify
 from tests.recording.example_run import BLOCK_SAMPLES, START, block, run, write
-from twin.cli.table import app
 from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
 from twin.recording.reader import read_recording
@@ -18,17 +15,6 @@ from twin.recording.run_paths import PARTS_FOLDER, resolve_log_path
 from twin.replay.verify import find_missing_end
 
 PLANNED = START.planned_samples
-
-
-def verify(*words: object) -> tuple[int, dict[str, Any]]:
-    """(exit code, what it says as JSON)."""
-    result = CliRunner().invoke(app, ["verify", *map(str, words), "--json"])
-    return result.exit_code, json.loads(result.stdout)
-
-
-def read_output_lines(*words: object) -> list[str]:
-    """The lines that it says to people."""
-    return CliRunner().invoke(app, ["verify", *map(str, words)]).stdout.splitlines()
 
 
 @pytest.fixture
@@ -55,21 +41,21 @@ def test_half_a_test_is_not_whole_even_if_its_file_is(cut: Path) -> None:
     assert not [
         gap for gap in read_recording(new).records(SampleGap) if not gap.channel
     ]  # nobody knows what was lost
-    lines = read_output_lines(new)
+    lines = read_output(new).splitlines()
     assert lines[-1] == "the file is whole, the recording has dropouts"
     assert any(f"samples {end} to {PLANNED - 1} " in line and "no end" in line for line in lines)
 
 
 def test_a_repaired_log_says_of_what(cut: Path) -> None:
     new = cut.with_name("new.mcap")
-    assert any("`--repair NEW`" in line for line in read_output_lines(cut))
-    lines = read_output_lines(cut, "--repair", new)
+    assert any("`--repair NEW`" in line for line in read_output(cut).splitlines())
+    lines = read_output(cut, "--repair", new).splitlines()
     assert new.exists()
     assert "damaged" in lines
     assert not any("--repair NEW" in line for line in lines)  # it was given
     assert any(
         line.startswith("repaired: from run.mcap: the file was never")
-        for line in read_output_lines(new)
+        for line in read_output(new).splitlines()
     )
     assert verify(new)[1]["repaired"]["from_1"] == "run.mcap"
     assert verify(cut)[1]["repaired"] == {}
@@ -83,7 +69,7 @@ def test_no_end_is_a_gap_even_of_no_samples(tmp_path: Path) -> None:
     assert (code, report["gaps"][0]["count"]) == (4, 0)
     assert any(
         f"from sample {PLANNED + BLOCK_SAMPLES} (at " in line
-        for line in read_output_lines(tmp_path)
+        for line in read_output(tmp_path).splitlines()
     )
 
 
@@ -104,7 +90,7 @@ def test_parts_alone_are_no_log_yet(tmp_path: Path) -> None:
     code, report = verify(folder)
     assert (code, report["sound"], report["apart"]) == (4, False, [words])
     assert report["samples"]["acquired"] == PLANNED
-    assert read_output_lines(folder)[-1] == words
+    assert read_output(folder).splitlines()[-1] == words
     (folder / PARTS_FOLDER / "part-001.mcap").rename(folder / "run.mcap")
     assert "apart" in verify(folder)[1]
     assert verify(folder)[1]["apart"] == []

@@ -23,30 +23,17 @@ from table_io.records import (
 )
 from tests.builders.recordings import store_items
 from tests.input_errors import raises_input_error
-from tests.replay.in_memory import recorded_in
+from tests.replay.in_memory import again, recorded_in
 from twin.compare import pipeline, twins
 from twin.compare.monitoring import EVENT_KINDS
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.recording.tabular import parse_step_range
 from twin.replay.command import ReplayRequest, replay_logs
-from twin.replay.pipeline_replay import RecordedRun, ReplayComparison, SampleRange, replay_recording
-from twin.replay.task import describe_replay
-from twin.results.contracts import ReplayResult
+from twin.replay.pipeline_replay import RecordedRun, SampleRange
 from twin.setup.run_config import RunConfig
 from twin.system.exit_codes import EXIT_NOT_IDENTICAL
 from twin.transport.codec import Item, encode_item
-
-
-def again(
-    recorded: RecordedRun,
-    bundle: RunConfig,
-    path: Path,
-    span: SampleRange | None = None,
-    cut: int = 0,
-) -> tuple[ReplayComparison, Recording]:
-    identity = replay_recording(recorded, bundle, path, "again", lambda _: None, span, cut)
-    return identity, read_recording(path)
 
 
 def encode_records(recording: Recording, *kinds: type) -> list[bytes]:
@@ -260,21 +247,6 @@ def plant_versions(log_file: Path, folder: Path, **versions: str) -> Path:
     path = folder / "planted.mcap"
     write_items(path, with_values(recording.items, recording.start, start), start)
     return path
-
-
-@pytest.fixture
-def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the command has to say of a replay; no report is drawn."""
-    kept: dict[str, Any] = {}
-
-    def describe(*given: Any) -> ReplayResult:
-        result = describe_replay(*given)
-        kept.update(result.to_plain())
-        return result
-
-    monkeypatch.setattr("twin.replay.task.describe_replay", describe)
-    monkeypatch.setattr("twin.report.finalize.write_report", lambda *_: None)
-    return kept
 
 
 def test_another_version_alone_makes_no_difference(

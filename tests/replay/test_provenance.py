@@ -8,25 +8,16 @@ from typing import Any
 import pytest
 
 from table_io.records import Comparison, Event, Fault, Timing
-from tests.replay.in_memory import recorded_in
+from tests.replay.in_memory import again, recorded_in
 from twin.recording.mcap_log import write_items
 from twin.recording.reader import Recording, read_recording
 from twin.replay.command import ReplayRequest, replay_logs
-from twin.replay.pipeline_replay import ReplayComparison, SampleRange, replay_recording
-from twin.replay.task import describe_replay
+from twin.replay.pipeline_replay import SampleRange
 from twin.replay.verify import ReplayOutlook, examine_logs, verify_logs
-from twin.results.contracts import ReplayResult
 from twin.setup.run_config import RunConfig
 from twin.system.exit_codes import EXIT_ABORTED, EXIT_NOT_IDENTICAL
 from twin.system.versions import read_installed_versions
 from twin.transport.codec import Item
-
-
-def again(
-    recording: Recording, bundle: RunConfig, path: Path, run: str, span: SampleRange | None = None
-) -> tuple[ReplayComparison, Recording]:
-    identity = replay_recording(recorded_in(recording), bundle, path, run, lambda _: None, span)
-    return identity, read_recording(path)
 
 
 def notes(recording: Recording, kind: str) -> list[str]:
@@ -45,22 +36,7 @@ def without_comparisons(recording: Recording, path: Path, *, ended: bool) -> Pat
 @pytest.fixture
 def some_steps(recording: Recording, bundle: RunConfig, tmp_path: Path) -> Recording:
     span = SampleRange.of_steps(recording, 2, 3)
-    return again(recording, bundle, tmp_path / "some.mcap", "some", span)[1]
-
-
-@pytest.fixture
-def report(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What the command has to say of a replay; no report is drawn."""
-    kept: dict[str, Any] = {}
-
-    def describe(*given: Any) -> ReplayResult:
-        result = describe_replay(*given)
-        kept.update(result.to_plain())
-        return result
-
-    monkeypatch.setattr("twin.replay.task.describe_replay", describe)
-    monkeypatch.setattr("twin.report.finalize.write_report", lambda *_: None)
-    return kept
+    return again(recorded_in(recording), bundle, tmp_path / "some.mcap", span, run="some")[1]
 
 
 def test_replay_states_versions_and_source(
@@ -71,14 +47,14 @@ def test_replay_states_versions_and_source(
     )
     write_items(tmp_path / "old.mcap", [start, *recording.items[1:]], start)
     old = read_recording(tmp_path / "old.mcap")
-    _, made = again(old, bundle, tmp_path / "new.mcap", "new")
+    _, made = again(recorded_in(old), bundle, tmp_path / "new.mcap", run="new")
     assert made.start.versions == read_installed_versions()
     assert made.start.host == recording.start.host
     assert made.start.started_at > "2"
     content = old.metadata["content"]["sha256"]
     assert notes(made, "replay") == [f"replay of {old.run}, sha256 of its content {content}"]
     assert notes(made, "cut") == []
-    _, third = again(made, bundle, tmp_path / "third.mcap", "third")
+    _, third = again(recorded_in(made), bundle, tmp_path / "third.mcap", run="third")
     assert len(notes(third, "replay")) == 2  # of a replay: the whole chain
     assert notes(third, "replay")[0] != notes(third, "replay")[1]
 

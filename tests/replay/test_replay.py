@@ -268,7 +268,7 @@ def test_a_simulated_curve_of_free_flight_is_the_closed_form(
     bundle: RunConfig, tmp_path: Path
 ) -> None:
     """Smooth, the same both ways, |u| = A / |K/M - w^2 + i w C/M|, within the transient left."""
-    free = bundle.profile_toml.replace("= 4.0\n[", "= inf\n[").replace(
+    free = bundle.profile_toml.replace("gap_mm = 4.0", "gap_mm = inf").replace(
         "cycles = 4\n", "cycles = 30\n"
     )
     free = free.replace("start_hz = 2.4", "start_hz = 1.4")
