@@ -16,15 +16,14 @@ gap_mm = 4.0
 kind = "record"
 file = "motion.csv"
 """
-UNCHECKED: Mapping[str, Mapping[str, Any]] = {
+Tables = dict[str, dict[str, Any]]  # of a profile, by name
+UNCHECKED: Tables = {
     "loop_check": {"enabled": False},
     "control": {"enabled": False},
 }
-NO_LOOP_CHECK: Mapping[str, Mapping[str, Any]] = {"loop_check": {"enabled": False}}
-AT_1_KHZ: Mapping[str, Mapping[str, Any]] = {"acquisition": {"rate_hz": 1000.0}}
-AT_1_KHZ_BY_50: Mapping[str, Mapping[str, Any]] = {
-    "acquisition": {"rate_hz": 1000.0, "block_samples": 50}
-}
+NO_LOOP_CHECK: Tables = {"loop_check": {"enabled": False}}
+AT_1_KHZ: Tables = {"acquisition": {"rate_hz": 1000.0}}
+AT_1_KHZ_BY_50: Tables = {"acquisition": {"rate_hz": 1000.0, "block_samples": 50}}
 GRID = {"start_hz": 2.0, "stop_hz": 3.0, "step_hz": 0.5, "cycles": 4, "measured_cycles": 2}
 
 

@@ -39,7 +39,7 @@ PRECOMPRESSED = {"gap_mm": -2.0, "start_hz": 4.0, "stop_hz": 8.0, "step_hz": 1.0
 
 
 def run_test(
-    folder: Path, sweep: dict[str, float], truth: str = "", laser_range_mm: float = 100.0
+    folder: Path, sweep: dict[str, Any], truth: str = "", laser_range_mm: float = 100.0
 ) -> Json:
     """Summary of a run on a rig that hides a truth, as written."""
     rig = tomllib.loads(RIG_TEXT)
@@ -81,7 +81,7 @@ def test_another_clean_rig_with_precompressed_bumpers_agrees(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(("sweep", "truth"), [(IMPACTS, FRICTION), (PRECOMPRESSED, STIFF_BUMPERS)])
 def test_the_twin_of_another_specimen_departs_while_the_test_is_complete(
-    sweep: dict[str, float], truth: str, tmp_path: Path
+    sweep: dict[str, Any], truth: str, tmp_path: Path
 ) -> None:
     summary = run_test(tmp_path, sweep, truth)
     verdict = summary["twin_verdict"]
