@@ -1,5 +1,6 @@
 """A campaign from its file to its end: order, refusals, what a resume keeps."""
 
+import math
 import shlex
 import tomllib
 from pathlib import Path
@@ -8,8 +9,11 @@ from typing import cast
 
 import pytest
 
+from table_io.config.base import PROFILES_DIR
+from table_io.config.excitation.stepped_sine import Sweep
 from table_io.config.profile import SetUpConfirmation
 from table_io.errors import InputError
+from table_io.records import Check, PrcPoint
 from tests.campaign.campaigns import (
     LISTED,
     Players,
@@ -23,8 +27,11 @@ from tests.input_errors import raises_input_error
 from twin.campaign import command
 from twin.campaign.command import CampaignOptions, run_campaign
 from twin.campaign.config import CampaignPlan
+from twin.campaign.figures import _is_covered_finer
 from twin.campaign.state import (
     LOCK_FILE,
+    RunPart,
+    RunState,
     append_sections,
     copy_configs,
     hold_lock,
@@ -32,7 +39,11 @@ from twin.campaign.state import (
     require_unchanged,
     write_state,
 )
-from twin.setup.run_config import RunConfig
+from twin.campaign.summary import merge_summaries
+from twin.recording.reader import read_recording
+from twin.results.summary import summarise
+from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.unpaced import play_unpaced
 
 
 @pytest.fixture
@@ -266,3 +277,35 @@ def test_the_resume_command_repeats_every_option(
         assert getattr(again, name) == getattr(first, name)
     assert again.access_words == first.access_words
     assert (again.start_page is None) == (first.start_page is None)
+
+
+def test_checks_of_a_resumed_run_are_those_of_its_last_part(tmp_path: Path) -> None:
+    text = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()
+    profile = tmp_path / "short.toml"
+    profile.write_text(
+        text.replace("start_hz = 2.4", "start_hz = 4.2").replace("cycles = 5", "cycles = 3")
+    )
+    config = read_run_config(profile)
+    path = tmp_path / "run.mcap"
+    play_unpaced(config, "run", path, lambda: None, lambda _: None)
+    recording = read_recording(path)
+    summary = summarise(recording, config.parameters)
+    assert len(summary.checks) == len(recording.records(Check)) > 0
+    parts = tuple(RunPart(folder=f"{n}", run=f"run{n}", first_step=0) for n in range(3))
+    state = RunState(name="short", label="short", status="complete", parts=parts)
+    for summaries in ([summary] * 3, [summary, summary, None]):  # the last part has none yet
+        merged = merge_summaries(state, config.profile, summaries)
+        assert merged.checks == summary.checks
+
+
+@pytest.mark.parametrize(
+    ("direction", "hz", "is_covered"),
+    [("forward", 3.4, True), ("backward", 3.4, False), ("forward", 4.4, False)],
+)
+def test_a_finer_sweep_of_one_direction_covers_its_own_points_only(
+    direction: str, hz: float, is_covered: bool
+) -> None:
+    coarse = Sweep(start_hz=2.0, stop_hz=5.0, step_hz=0.2, cycles=4)
+    finer = Sweep(start_hz=3.0, stop_hz=4.0, step_hz=0.1, cycles=4, directions=("forward",))
+    point = PrcPoint(0, 0, direction, hz, None, None, math.nan, math.nan, math.nan)
+    assert _is_covered_finer(point, coarse, [coarse, finer]) == is_covered

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import blocks, start_record
+from twin.inspection.curves import print_curves
 from twin.recording import merge
 from twin.recording.mcap_log import LogWriter, iter_messages
 from twin.recording.merge import LOCK_FILE, merge_run_parts, verify_log
-from twin.recording.run_paths import PARTS_FOLDER
+from twin.recording.run_paths import PARTS_FOLDER, resolve_log_path
 from twin.transport.codec import encode_item, topic_for
 
 ITEMS = [start_record(), *blocks()[:60]]
@@ -182,3 +184,21 @@ def test_damaged_parts_are_copied_before_the_log_is_renamed(
     merge_run_parts(run)
     assert kept.read_bytes() == bytes(raw) + bytes(600)
     assert sorted(path.name for path in run.iterdir()) == ["damaged", "run.mcap"]
+
+
+def test_a_folder_or_its_log_is_resolved_to_the_log(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    log.touch()
+    assert resolve_log_path(tmp_path) == resolve_log_path(log) == log
+
+
+def test_a_folder_without_a_recording_is_named_as_typed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes.txt").touch()
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError) as error:
+        print_curves(Path("full"), False)
+    assert error.value.where == "full"
+    assert "run.mcap" in error.value.remedy

@@ -11,11 +11,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure
 
 from tests.monitor.browser import Browser, open_browser
 from tests.reports.folders import Drawn
+from twin.drawing import page
 from twin.drawing.charts import MAX_POINTS, make_chart_script, reduce_envelope, reduce_line
 from twin.drawing.panels import CaptionedFigure, Key, PanelFigure
+from twin.drawing.pictures import save_figures
 
 COUNT_INKED = """[...document.querySelectorAll('.chart .uplot canvas')].map((canvas) =>
   canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data
@@ -173,3 +176,42 @@ def test_pointer_shows_the_value_and_drag_zooms_the_panels_of_a_figure(
         send("mouseReleased", 0.5, 0.5, True, count)
     send("mouseMoved", 0.01, 0.01)
     assert draw() == whole
+
+
+def draw_line() -> Iterator[CaptionedFigure]:
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([0.0, 1.0, 2.0], [0.0, 3.0, 1.0])
+    axes.set_xlim(0.5, 1.5)  # the line is clipped
+    yield CaptionedFigure("line", "title", "caption", figure)
+
+
+def test_equal_figures_are_equal_bytes_as_svg(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        save_figures(draw_line(), tmp_path / name, more_formats=("svg",))
+    first, second = ((tmp_path / name / "line.svg").read_bytes() for name in ("first", "second"))
+    assert first == second
+    assert b"clip" in first
+    assert b"<dc:date>" not in first
+
+
+def test_a_template_that_was_compiled_before_follows_its_text(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page, "CACHE_DIR", tmp_path / "cache")
+    template = tmp_path / "page.html"
+    for text in ("{{ value }} mm", "{{ value }} mm", "{{ 2 * value }} mm"):
+        template.write_text(text)
+        rendered = page.render_page(template, value=4)
+    assert rendered == "8 mm"
+    assert len([*(tmp_path / "cache").iterdir()]) == 1
+
+
+def test_a_page_is_rendered_where_no_cache_can_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(page, "CACHE_DIR", tmp_path / "file" / "cache")
+    template = tmp_path / "page.html"
+    template.write_text("{{ value }} mm")
+    assert page.render_page(template, value=4) == "4 mm"

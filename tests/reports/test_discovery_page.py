@@ -3,6 +3,7 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,8 @@ from table_io.config.base import parse_toml
 from tests.builders.profiles import AT_1_KHZ_BY_50, UNCHECKED, format_test
 from tests.builders.rigs import RIG_TEXT
 from tests.builders.truths import hide_truth
+from tests.discovery.played import prepare_bare_log
+from tests.recovery.scaled_specimens import Hidden, prepare, record_block, simulate, start_model
 from tests.reports.folders import draw_in_full_quality
 from twin.discovery.build_verdict import build_verdict
 from twin.discovery.discover import Discovery, PreparedLog, discover_effects
@@ -23,9 +26,11 @@ from twin.discovery.figure_data import (
     measured_forces,
 )
 from twin.discovery.free_running import compute_misfits, run_log_free, run_logs_free
+from twin.discovery.least_squares import FitResult
 from twin.discovery.loading import load_logs, name_logs
+from twin.discovery.model_file import format_fitted_model
 from twin.discovery.page import format_with_interval, write_discovery_page
-from twin.discovery.parameters import GapKey
+from twin.discovery.parameters import INPUT_GAIN, INPUT_OFFSET, EffectKey, GapKey
 from twin.discovery.result import EffectResult, Interval, Verdict
 from twin.discovery.task import collect_result
 from twin.discovery.words import format_verdict
@@ -381,3 +386,66 @@ def test_the_gates_pass_where_no_sensor_errs_and_fail_where_one_does(
     failed = [gate.label for gate in check_instruments(broken_view) if not gate.passed]
     assert failed[0].startswith("mass: ")
     assert len(failed) == 1 + len(sheet.rest_channels)
+
+
+CUBIC = Hidden("cubic_stiffness", 3e6)
+
+
+@cache
+def without_accelerometer() -> tuple[Discovery, PreparedLog]:
+    """A record whose force of inertia is a second derivative: its balance is whitened in a fit."""
+    block = record_block(CUBIC, noise=2e-4)
+    kept = [k for k, name in enumerate(block.channels) if name != "mass_acc_m_s2"]
+    bare = replace(
+        block, channels=tuple(block.channels[k] for k in kept), values=block.values[kept]
+    )
+    log = prepare(bare, CUBIC)
+    return discover_effects([log], start_model()), log
+
+
+def test_the_law_is_that_of_the_effect_over_its_displacement() -> None:
+    discovery, log = without_accelerometer()
+    assert discovery.verdict.best.names == ("cubic_stiffness",)
+    (forces,) = DiscoveryView(discovery, [log]).forces_of_each
+    u = simulate(CUBIC)[0]
+    law = CUBIC.a * u**3
+    k3 = discovery.verdict.best.fit.values[EffectKey("cubic_stiffness", "k3")]
+    assert k3 == pytest.approx(CUBIC.a, rel=0.02)
+    used = np.isfinite(forces.law[0])
+    assert used.sum() > 0.8 * u.size
+    largest = float(np.abs(law).max())
+    assert forces.law[0][used] == pytest.approx(law[used], abs=0.03 * largest)
+    required = forces.required[0][used]
+    assert np.corrcoef(required, law[used])[0, 1] > 0.95
+    assert np.isnan(forces.law[1:]).all()
+
+
+@pytest.fixture(scope="module")
+def fit() -> FitResult:
+    return prepare_bare_log().first_fit
+
+
+@pytest.mark.parametrize(
+    ("gain", "std_error", "named", "faulty"),
+    [
+        (1.0001, 5e-5, [], []),
+        (1.012, 5e-5, [], []),  # as in any laboratory
+        (1.05, 5e-5, [], ["sensor_gain"]),
+        (1.021, 0.01, [], []),  # not known that well
+        (1.012, 5e-5, ["sensor_gain.table_acc_m_s2"], ["sensor_gain"]),
+        (1.0, 5e-5, ["sensor_offset.table_acc_m_s2"], ["sensor_offset"]),
+    ],
+)
+def test_a_sound_sensor_of_the_table_is_not_to_be_repaired(
+    gain: float, std_error: float, named: list[str], faulty: list[str], fit: FitResult
+) -> None:
+    """Without an accelerometer on the specimen that of the table is fitted in every recording.
+
+    What a discovery names it says, however small.
+    """
+    parameters = fit.parameters.with_values({INPUT_GAIN: gain, INPUT_OFFSET: 1e-3})
+    std_errors = {**fit.std_errors, INPUT_GAIN: std_error, INPUT_OFFSET: 1e-4}
+    fitted = replace(fit, parameters=parameters, std_errors=std_errors)
+    text, notes = format_fitted_model(fitted, "specimen", "", "a log", named=named)
+    assert "sensor" not in text
+    assert [note.partition(".")[0] for note in notes] == faulty

@@ -1,8 +1,12 @@
-"""Error of a table against the record itself, before the filter of its profile."""
+"""Error of a table against its record before the filter, and the peaks that are listed."""
+
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
+from twin.results.excitation_verdict import describe_peaks
 from twin.results.tracking import align_record, find_record_error
 
 RATE_HZ, BAND_HZ = 1000.0, (0.5, 20.0)
@@ -48,3 +52,26 @@ def test_lag_of_the_table_is_taken_out_of_the_error() -> None:
     assert find_record_error(record, target, late, RATE_HZ, BAND_HZ) > 0.2
     error = find_record_error(record, target, late, RATE_HZ, BAND_HZ, 15 / RATE_HZ)
     assert error == pytest.approx(0.0, abs=1e-6)
+
+
+def make_step(frequency_hz: float, excess: float, thd: float) -> Any:
+    return SimpleNamespace(
+        frequency_hz=frequency_hz,
+        direction="forward",
+        table_acc_fundamental_m_s2=0.49,
+        table_acc_peak_m_s2=0.49 * (1.0 + excess),
+        thd=thd,
+    )
+
+
+def test_peak_that_harmonics_raise_is_stated_with_the_worst_step_and_what_cancels_them() -> None:
+    steps = [make_step(3.9, 0.12, 0.07), make_step(4.0, 0.15, 0.08), make_step(5.0, 0.02, 0.04)]
+    (sentence,) = describe_peaks(steps)
+    assert "at 2 of 3" in sentence
+    assert "+15 % at 4 Hz" in sentence
+    assert "control.harmonics" in sentence
+
+
+@pytest.mark.parametrize("excess, thd", [(0.04, 0.08), (0.2, 0.01)])
+def test_small_peaks_and_those_of_noise_are_not(excess: float, thd: float) -> None:
+    assert describe_peaks([make_step(4.0, excess, thd)]) == []

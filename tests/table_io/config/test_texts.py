@@ -1,15 +1,59 @@
-"""A null character in a TOML file, which no file name can have."""
+"""Texts of files: tables written as TOML, texts with their hash, names with a null character."""
 
+import math
+import random
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import PROFILES_DIR, format_toml
+from table_io.config.provenance import require_seal, seal_text
 from table_io.errors import InputError
 from tests.input_errors import raises_input_error
 from twin.campaign.config import read_plan
 from twin.model.config import load_model_config
 from twin.setup.run_config import read_run_config
+
+
+def test_table_is_read_as_it_was_written() -> None:
+    table = {
+        "title": 'a "quote" \\ back\nline \x7f é',
+        "gap_mm": math.inf,
+        "least": -math.inf,
+        "value": 0.1 + 0.2,
+        "count": 3,
+        "enabled": False,
+        "band_hz": [0.3, math.inf],
+        "excitation": {"kind": "record", "files": {"a b.csv": "1\n2\n", "plain_key": ""}},
+        "sensors": [{"channel": "x", "range": 1e-12}, {"channel": "y", "deeper": {"a": 1}}],
+    }
+    assert tomllib.loads(format_toml(table)) == table
+    assert math.isnan(tomllib.loads(format_toml({"none": math.nan}))["none"])
+
+
+TEXT = 'title = "A table"\nresidual = 0.02\n[parameters]\ngain_1_s = 20.0\n'
+SEALED = seal_text(TEXT)
+
+
+def test_sealed_text_is_accepted_with_any_line_ends() -> None:
+    assert SEALED.startswith(TEXT)
+    for text in (SEALED, SEALED.replace("\n", "\r\n"), SEALED + "\n\n", TEXT):
+        require_seal(text, "the twin", "make it again")
+
+
+def test_every_altered_character_is_noticed() -> None:
+    rng = random.Random(1)
+    for place, character in enumerate(SEALED):
+        other = chr(rng.choice([n for n in range(33, 127) if chr(n) != character]))
+        with pytest.raises(InputError, match="the twin was altered after it was written"):
+            require_seal(SEALED[:place] + other + SEALED[place + 1 :], "the twin", "make it again")
+
+
+def test_removed_hash_is_noticed() -> None:
+    with pytest.raises(InputError):
+        require_seal(SEALED[: SEALED.rindex("# sha256")], "the twin", "make it again")
+
 
 QUICKSTART = (PROFILES_DIR / "tests" / "quickstart.toml").read_text()
 
