@@ -1,4 +1,4 @@
-"""Tutorials and README run as they are written, each cell, in a folder of its own."""
+"""Tutorials run as written, each cell, in a folder of its own; links and commands of the README."""
 
 import json
 import re
