@@ -22,9 +22,9 @@ from twin.discovery.command import run_discovery, run_identification
 from twin.discovery.discover import Discovery, prepare_problem
 from twin.discovery.free_running import run_log_free
 from twin.discovery.loading import load_logs
-from twin.discovery.selection import Cancelled
 from twin.discovery.task import DiscoveredModel, discover
 from twin.discovery.words import format_verdict
+from twin.evidence.selection import Cancelled
 from twin.exchange.import_table import ImportOptions, import_table
 from twin.laws.library import EFFECTS
 from twin.recording.reader import read_recording

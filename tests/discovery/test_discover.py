@@ -25,15 +25,12 @@ from twin.discovery.evidence import build_evidence
 from twin.discovery.localization import PHASES, build_cells, classify_phases, localize_excess
 from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import EffectKey
-from twin.discovery.selection import (
-    Cancelled,
-    Explanation,
-    FittedSet,
-    SelectionProgress,
-)
+from twin.discovery.selection import FittedSet, SelectionProgress
 from twin.discovery.sensor_checks import check_sensors
 from twin.discovery.units import assign_folds
-from twin.discovery.verdict import DiscoveryVerdict, closed_fraction, judge_selection
+from twin.discovery.verdict import closed_fraction
+from twin.evidence.selection import Cancelled, Explanation
+from twin.evidence.verdict import Verdict, judge_selection
 from twin.laws.library import EFFECTS
 
 # What is left out where the library is not the subject: with the whole of it, it takes long.
@@ -270,13 +267,13 @@ def test_what_all_probable_sets_share_is_named() -> None:
     sets = [replace(named.best, effects=(*named.best.effects, effect)) for effect in some]
     tried = (named.best, *sets)
 
-    def judge(fitted: Sequence[FittedSet], probabilities: Sequence[float]) -> DiscoveryVerdict:
+    def judge(fitted: Sequence[FittedSet], probabilities: Sequence[float]) -> Verdict[FittedSet]:
         explanations = tuple(
             Explanation(tuple(sorted(each.names)), "", probability)
             for each, probability in zip(fitted, probabilities, strict=True)
         )
         selection = replace(named, best=fitted[0], tried=tried, explanations=explanations)
-        return judge_selection(problem, selection, named.best.cost)
+        return judge_selection(problem, selection)
 
     shared = judge(sets, (0.6, 0.4))
     assert (shared.outcome, shared.best.names) == ("named", ("bumper_hardening",))
@@ -296,7 +293,7 @@ def test_an_effect_is_named_only_where_its_absence_is_excluded(none: float, outc
         Explanation(named.best.names, "", 1.0 - none), Explanation((), "", none)
     )  # fmt: skip
     selection = replace(named, explanations=explanations)
-    verdict = judge_selection(discovery.prepared.problem, selection, named.best.cost)
+    verdict = judge_selection(discovery.prepared.problem, selection)
     assert verdict.outcome == outcome
     assert verdict.effects_confidence == pytest.approx(1.0 - none)
 
@@ -306,7 +303,7 @@ def test_a_stranger_beside_no_effect_is_unexplained_in_its_place() -> None:
     named = discovery.selection
     explanations = (Explanation((), "bumpers", 0.97), Explanation((), "", 0.03))
     selection = replace(named, best=named.null, explanations=explanations)
-    verdict = judge_selection(discovery.prepared.problem, selection, named.best.cost)
+    verdict = judge_selection(discovery.prepared.problem, selection)
     assert (verdict.outcome, verdict.place) == ("unexplained", "bumpers")
     assert "bumpers" in verdict.reason
 
@@ -379,7 +376,7 @@ def test_linear_algebra_foresees_what_a_refit_finds() -> None:
     variant = linear.variants[column]
     assert variant.candidate.name == "coulomb_friction"
     amplitude = float(linear.estimate([column])[0][0])
-    refitted = bench.fit_effects(variant.add_to(start, amplitude), [variant.candidate])
+    refitted = bench.refit(bench.fit_effects(start, ()), [(variant, amplitude)])
     entries = sum(residual.size for residual in refitted.held_out)
     kept = (bench.fit_effects(start, ()).fit.cost - refitted.fit.cost) * entries
     assert linear.measure_gain([column]) * linear.inflation == pytest.approx(kept, rel=0.05)

@@ -10,10 +10,11 @@ from table_io.block import Float2D
 from tests.discovery.played import prepare_bare_log
 from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
-from twin.discovery.evidence import EFFECT_SHARE, LinearEvidence, Variant, build_evidence
+from twin.discovery.evidence import build_evidence
 from twin.discovery.law_terms import make_law_candidate
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
+from twin.evidence.linear import EFFECT_SHARE, LinearEvidence, Variant
 from twin.laws.terms import FAMILIES
 
 ENTRIES, FORCE = 400, 100.0

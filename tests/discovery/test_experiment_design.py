@@ -15,7 +15,7 @@ from tests.laws.test_effect_files import read_effect
 from twin.discovery import decisive_test
 from twin.discovery.decisive_test import CandidateTest, list_candidate_tests
 from twin.discovery.discover import PreparedLog, PreparedProblem, prepare_problem
-from twin.discovery.evidence import LinearEvidence, build_evidence
+from twin.discovery.evidence import build_evidence
 from twin.discovery.experiment_design import (
     IdealTableMotion,
     Rival,
@@ -41,6 +41,7 @@ from twin.discovery.parameters import (
 from twin.discovery.selection import FittedSet, SelectionResult
 from twin.discovery.signals import build_signals
 from twin.discovery.verdict import DiscoveryVerdict, widen_for_form
+from twin.evidence.linear import LinearEvidence
 from twin.model.model import EffectInstance, Model
 from twin.model.parameters import Parameters
 from twin.model.prepare import prepare_solver
@@ -349,7 +350,7 @@ def test_a_sweep_shows_what_a_noisy_test_at_one_frequency_cannot() -> None:
 
 def test_a_proposed_law_is_among_the_rivals(relaxing: Recorded) -> None:
     null, law = relaxing.fit().fitted, relaxing.fit("cubic_stiffness").fitted
-    unexplained = DiscoveryVerdict("unexplained", null, 0.9, 0.9, (), 1.0, True, "")
+    unexplained = DiscoveryVerdict("unexplained", null, 0.9, 0.9, (), True, "", "", 1.0)
     rivals = list_rivals(SelectionResult(null, null), unexplained, law)
     assert [rival.fitted for rival in rivals] == [null, law]
 
@@ -358,7 +359,7 @@ def test_intervals_hold_what_an_inexact_form_leaves(relaxing: Recorded) -> None:
     """Half of the residual squares: as much in each of the parameters, over their white errors."""
     best = relaxing.fit("maxwell_damper", k1=12e3, tau=0.06).fitted
     key = EffectKey("maxwell_damper", "k1", "")
-    exact = DiscoveryVerdict("named", best, 0.9, 0.9, (), best.cost, False, "")
+    exact = DiscoveryVerdict("named", best, 0.9, 0.9, (), False, "", "", best.cost)
     unseen = widen_for_form(exact)
     assert unseen.best.fit.std_errors == best.fit.std_errors
     half = replace(exact, floor=best.cost / 2)

@@ -7,7 +7,7 @@ from twin.discovery.discover import Discovery, PreparedLog
 from twin.discovery.held_out import compute_force_error
 from twin.discovery.hidden_effects import bound_effects
 from twin.discovery.law_search import LawProposal
-from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
+from twin.discovery.least_squares import FitResult
 from twin.discovery.nuisances import list_sizes
 from twin.discovery.parameters import (
     SLIP_SPEED,
@@ -41,12 +41,9 @@ from twin.discovery.result import (
 )
 from twin.discovery.selection import FittedSet, SelectionProblem
 from twin.discovery.sensor_checks import SensorCheck, check_sensors
-from twin.discovery.verdict import (
-    EXCLUDED_PROBABILITY,
-    closed_fraction,
-    suggest_next_run,
-    sum_by_set,
-)
+from twin.discovery.verdict import closed_fraction, suggest_next_run
+from twin.evidence.linear import INTERVAL_SIGMA
+from twin.evidence.verdict import EXCLUDED_PROBABILITY, sum_by_set
 from twin.model.model import Model
 
 METRIC = (

@@ -86,6 +86,18 @@ class Candidate:
         parameters = parameters.with_effect(self.effect)
         return parameters.with_values(values).with_free((*parameters.free, *self.free))
 
+    def start_in(
+        self, parameters: ParameterSet, shape: Sequence[float], change: float
+    ) -> ParameterSet:
+        """Add the candidate with so much more than its vanishing amplitude, within its bounds."""
+        start, free = self.vanishing + change, self.amplitude
+        return self.add_to(parameters, shape, min(max(start, free.low), free.high))
+
+    @property
+    def used_keys(self) -> frozenset[object]:
+        """Parameters, and coefficients by which the solver knows the candidate."""
+        return frozenset((*(free.key for free in self.free), *self.effect.compiled))
+
     def remove_from(self, parameters: ParameterSet) -> ParameterSet:
         """Return a parameter set without the parameters of the candidate."""
         reduced = parameters.without(self.free)

@@ -17,7 +17,6 @@ from twin.discovery.features.task import (
     FeatureProgress,
     discover_features,
 )
-from twin.discovery.least_squares import INTERVAL_SIGMA
 from twin.discovery.page import write_discovery_page, write_identification_page
 from twin.discovery.parameters import GapKey
 from twin.discovery.result import (
@@ -29,7 +28,7 @@ from twin.discovery.result import (
     describe_fit,
     label_feature,
 )
-from twin.discovery.selection import Cancelled, ProgressCallback, SelectionProgress
+from twin.discovery.selection import ProgressCallback, SelectionProgress
 from twin.discovery.task import DiscoveredModel, PathLike, discover, identify
 from twin.discovery.words import (
     describe_excluded,
@@ -39,6 +38,8 @@ from twin.discovery.words import (
     format_share,
     format_verdict,
 )
+from twin.evidence.linear import INTERVAL_SIGMA
+from twin.evidence.selection import Cancelled
 from twin.results.quantities import format_quantity
 from twin.setup.folders import make_output_folder, make_run_folder, remove_empty_folders
 from twin.system.exit_codes import EXIT_INTERRUPTED

@@ -10,8 +10,8 @@ from table_io.clock import local_datetime
 from table_io.errors import InputError
 from twin.discovery.decisive_test import DecideOptions, TestProposal
 from twin.discovery.result import ChainLink, Verdict
-from twin.discovery.selection import Cancelled
 from twin.discovery.task import DiscoveredModel, PathLike, discover
+from twin.evidence.selection import Cancelled
 from twin.live.run_command import run_test
 from twin.results.recordings import open_recording
 from twin.setup.folders import make_output_folder, make_run_folder

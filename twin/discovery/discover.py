@@ -38,7 +38,6 @@ from twin.discovery.residuals import MAX_GAP_ERROR_M, LogResiduals, build_log_re
 from twin.discovery.selection import (
     FittedSet,
     ProgressCallback,
-    RoundEffort,
     SelectionProblem,
     SelectionProgress,
     SelectionResult,
@@ -46,12 +45,9 @@ from twin.discovery.selection import (
     select_effects,
 )
 from twin.discovery.signals import LogSignals, derives_acc
-from twin.discovery.verdict import (
-    DiscoveryVerdict,
-    judge_selection,
-    qualify_none,
-    widen_for_form,
-)
+from twin.discovery.verdict import DiscoveryVerdict, qualify_none, widen_for_form
+from twin.evidence.selection import RoundEffort
+from twin.evidence.verdict import judge_selection
 from twin.model.model import Model
 
 MIN_ENTRIES, MIN_BLOCKS = 1000, 9
@@ -323,7 +319,8 @@ def _judge(
     steps = [log.steps for log in logs]
     # a residual below the noise means that the noise was overestimated
     floor = min(problem.noise, selection.best.cost)
-    verdict = widen_for_form(judge_selection(problem, selection, floor))
+    verdict = DiscoveryVerdict.of(judge_selection(problem, selection), floor)
+    verdict = widen_for_form(verdict)
     widened = widen_intervals(verdict.best.fit, problem.log_residuals)
     verdict = replace(verdict, best=replace(verdict.best, fit=widened))
     verdict = qualify_none(selection, verdict)

@@ -21,11 +21,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.compare.sensors import apply_sensors, lag_samples
 from twin.discovery.hidden_effects import UndetectedEffect, find_hidden_effects
-from twin.discovery.least_squares import (
-    INTERVAL_SIGMA,
-    fill_jacobian,
-    solve_damped,
-)
+from twin.discovery.least_squares import fill_jacobian, solve_damped
 from twin.discovery.nuisances import linearize_nuisances, list_nuisance_parameters
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
@@ -46,7 +42,9 @@ from twin.discovery.selection import (
     mean_square,
 )
 from twin.discovery.signals import LogSignals, build_signals
-from twin.discovery.verdict import EXCLUDED_PROBABILITY, DiscoveryVerdict
+from twin.discovery.verdict import DiscoveryVerdict
+from twin.evidence.linear import INTERVAL_SIGMA
+from twin.evidence.verdict import EXCLUDED_PROBABILITY
 from twin.model.model import Model
 from twin.model.prepare import prepare_solver
 from twin.model.solver import OUTPUT_COUNT

@@ -10,8 +10,8 @@ import math
 from dataclasses import dataclass, replace
 
 from twin.discovery.candidates import Candidate
-from twin.discovery.evidence import LinearEvidence
 from twin.discovery.selection import FittedSet
+from twin.evidence.linear import LinearEvidence
 
 FORCE_LAWS = ("force", "linear")  # by `Effect.acts`: what has a form and a size
 # Largest force of an effect that recordings may hide, of that of the record (rms). At 5 % of noise
@@ -44,7 +44,9 @@ class UndetectedEffect:
         return replace(self, deviation=factor * self.deviation, share=factor * self.share)
 
 
-def bound_effects(linear: LinearEvidence | None, best: FittedSet) -> list[list[UndetectedEffect]]:
+def bound_effects(
+    linear: LinearEvidence[Candidate] | None, best: FittedSet
+) -> list[list[UndetectedEffect]]:
     """Return each effect that is not in a set in all its forms, the one that shows best first.
 
     `linear` is about that set.
@@ -65,7 +67,7 @@ def bound_effects(linear: LinearEvidence | None, best: FittedSet) -> list[list[U
 
 
 def find_hidden_effects(
-    linear: LinearEvidence | None, best: FittedSet
+    linear: LinearEvidence[Candidate] | None, best: FittedSet
 ) -> tuple[UndetectedEffect, ...]:
     """Return each further force law as large as the noise may hide it, where it is not blind."""
     clearest = [forms[0] for forms in bound_effects(linear, best)]
@@ -75,7 +77,7 @@ def find_hidden_effects(
 
 
 def find_blind_spots(
-    linear: LinearEvidence | None, best: FittedSet
+    linear: LinearEvidence[Candidate] | None, best: FittedSet
 ) -> tuple[UndetectedEffect, ...]:
     """Return the force laws that could be large in any form without leaving more than noise.
 

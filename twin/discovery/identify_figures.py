@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 
 from twin.discovery.cross_checks import fitted_gap
 from twin.discovery.identify import IdentificationResult
-from twin.discovery.least_squares import INTERVAL_SIGMA
 from twin.discovery.parameters import is_correction
 from twin.discovery.residuals import LogResiduals
 from twin.drawing.panels import CaptionedFigure, CaptionedFigures, Picture
@@ -20,6 +19,7 @@ from twin.drawing.plot_style import (
     SIDE_COLOURS,
     TWIN_COLOUR,
 )
+from twin.evidence.linear import INTERVAL_SIGMA
 
 MAX_POINTS = 6000  # of a scatter plot
 CLOUD_STYLE = {"ls": "", "marker": ".", "ms": 1.6, "mew": 0, "alpha": 0.6, "rasterized": True}

@@ -16,15 +16,10 @@ from twin.discovery.discover import Discovery
 from twin.discovery.law_terms import find_law_class, list_law_candidates, round_exponent
 from twin.discovery.parameters import EffectKey, ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.discovery.selection import (
-    FittedSet,
-    ProgressCallback,
-    RoundEffort,
-    SelectionProblem,
-    select_effects,
-)
+from twin.discovery.selection import FittedSet, ProgressCallback, SelectionProblem, select_effects
 from twin.discovery.symbolic_regression import list_symbolic_candidates
 from twin.discovery.verdict import closed_fraction
+from twin.evidence.selection import RoundEffort
 from twin.laws.effect import Effect, Place
 from twin.model.valid_range import list_inputs
 

@@ -20,7 +20,6 @@ from twin.discovery.residuals import LogResiduals
 
 MAX_ITERATIONS = 40
 MIN_INTERVAL_BLOCKS = 3.0  # effective blocks (cycles, contacts) below which there is no interval
-INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
 MIN_COST_GAIN = 1e-6  # relative cost decrease below which the iteration stops
 SLOPE_STEP = 1e-4  # finite-difference step, relative to the scale of a parameter
 HELD_OUT_DAMPINGS = (1e-9, 1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4)  # tried for the step of a fold's refit

@@ -4,9 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 
 from table_io.config.base import format_toml
-from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
+from twin.discovery.least_squares import FitResult
 from twin.discovery.nuisances import MAX_SIZE, TYPICAL_GAIN
 from twin.discovery.parameters import INPUT_GAIN, BaseKey, EffectKey, GapKey, SlipKey
+from twin.evidence.linear import INTERVAL_SIGMA
 from twin.laws.effect import Effect
 from twin.laws.effect_file import format_effect_file
 from twin.model.model import SENSOR_CHANNELS

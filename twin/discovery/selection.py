@@ -1,29 +1,23 @@
-"""Selection of missing effects by their evidence: rank all sets, refit the best, rank again.
-
-Each round ranks all sets of effects in the linear model about the best fit so far (`evidence`) and
-refits the most probable ones to all data, with cross-validation residuals over the steps.
-"""
+"""Selection problem of a specimen: residuals of its logs, and sets of effects fitted to them."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from itertools import zip_longest
 
 import numpy as np
 
 from table_io.block import Float1D, Int1D
 from twin.discovery.candidates import Candidate
-from twin.discovery.evidence import Hypothesis, LinearEvidence, build_evidence, softmax
+from twin.discovery.evidence import build_evidence
 from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
 from twin.discovery.units import assign_folds
+from twin.evidence import selection
+from twin.evidence.linear import LinearEvidence, Variant
+from twin.evidence.selection import MAX_ROUNDS, RoundEffort, search_sets
 
-MAX_EFFECTS = 3
-MAX_ROUNDS = 3  # of rankings, each about the best fit of the one before
-REFIT_NATS, MAX_REFITS = 5.0, 4  # below the best log evidence; sets refitted in a round
-MIN_PROBABILITY = 1e-3  # of an explanation that is reported
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero
 MIN_GAIN_SHARE = 0.03  # of the residual squares, overall or in one row, that an effect must remove
@@ -56,6 +50,11 @@ class FittedSet:
         """Mean square of the cross-validation residual over the noise."""
         return mean_square(self.held_out)
 
+    @property
+    def squares(self) -> float:
+        """Sum of the squares of the residual over the noise of the data that were fitted."""
+        return self.fit.cost * sum(values.size for values in self.held_out)
+
     def add_to(self, parameters: ParameterSet) -> ParameterSet:
         """Add the effects, free, to a parameter set at their fitted values."""
         values = self.fit.parameters.values
@@ -69,23 +68,6 @@ class FittedSet:
         for effect in self.effects:
             parameters = effect.remove_from(parameters)
         return parameters
-
-
-@dataclass(frozen=True, slots=True)
-class SelectionProgress:
-    """Progress of a selection: set being fitted, `index` of `count` of a stage, and best so far.
-
-    `index` is 0 at the start of a stage, before its first fit.
-    """
-
-    stage: str
-    names: tuple[str, ...] = ()
-    index: int = 0
-    count: int = 0
-    best: FittedSet | None = None
-
-
-ProgressCallback = Callable[[SelectionProgress], None]
 
 
 def mean_square(held_out: Sequence[Float1D]) -> float:
@@ -108,6 +90,33 @@ class SelectionProblem:
         """Fit `start`, with these effects added, to all data, with cross-validation residuals."""
         result = fit_with_misfit(self.log_residuals, start, self.folds, self.mapper)
         return FittedSet(tuple(effects), result)
+
+    def linearize(
+        self, current: FittedSet, tried: Sequence[FittedSet]
+    ) -> LinearEvidence[Candidate]:
+        """Return the linear model about a set without its effects, with the shapes tried."""
+        known_shapes = {
+            effect.name: fitted.find_shape(effect) for fitted in tried for effect in fitted.effects
+        }
+        rich = tuple((effect.name, known_shapes[effect.name]) for effect in current.effects)
+        base = current.remove_from(current.fit.parameters)
+        return build_evidence(
+            self.log_residuals, base, self.library, known_shapes, rich, self.mapper
+        )
+
+    def refit(
+        self, current: FittedSet, chosen: Sequence[tuple[Variant[Candidate], float]]
+    ) -> FittedSet:
+        """Return a fit with variants in place of a set's effects, from these amplitudes."""
+        parameters = current.remove_from(current.fit.parameters)
+        for variant, amplitude in chosen:
+            parameters = variant.candidate.start_in(parameters, variant.shape, amplitude)
+        return self.fit_effects(parameters, [variant.candidate for variant, _ in chosen])
+
+    @property
+    def limits(self) -> dict[str, tuple[str, ...]]:
+        """Names of the effects of which each candidate has others as limits, by its name."""
+        return {each.name: tuple(each.effect.limits) for each in self.library}
 
     @property
     def noise(self) -> float:
@@ -223,49 +232,9 @@ class SelectionProblem:
         return min(as_good, key=complexity)
 
 
-@dataclass(frozen=True, slots=True)
-class Explanation:
-    """Names of effects, the place of a stranger beside them or "", and their probability."""
-
-    names: tuple[str, ...]
-    place: str
-    probability: float
-
-
-@dataclass(frozen=True, eq=False)
-class SelectionResult:
-    """Outcome of a selection: the null (base alone), the best set, and every set refitted.
-
-    `explanations` are the most probable first. `evidence` is the linear model about the best set.
-    """
-
-    null: FittedSet
-    best: FittedSet
-    tried: tuple[FittedSet, ...] = field(default=())
-    complete: bool = True  # False after a cancellation
-    explanations: tuple[Explanation, ...] = ()
-    evidence: LinearEvidence | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RoundEffort:
-    """How far a round of a search goes: sets of so many effects, and which of them are refitted.
-
-    Those within so many nats of the most probable, and no more than `max_refits`. With a `share`
-    within that of its log evidence, and without a stranger, until one leaves noise alone: where
-    shapes are free, as those of laws are, a ladder of them promises little. With `if_open` a round
-    is left out where a set of those before leaves noise alone.
-    """
-
-    stage: str = "the most probable sets"
-    max_effects: int = MAX_EFFECTS
-    max_refits: int = MAX_REFITS
-    share: float = 0.0
-    if_open: bool = False
-
-
-class Cancelled(Exception):
-    """Exception for a progress callback to stop the selection and keep the best set so far."""
+SelectionProgress = selection.SelectionProgress[FittedSet]
+SelectionResult = selection.Selection[FittedSet, Candidate]
+ProgressCallback = Callable[[SelectionProgress], None]
 
 
 def select_effects(
@@ -275,129 +244,11 @@ def select_effects(
     first: FittedSet | None = None,
     rounds: Sequence[RoundEffort] = (RoundEffort(),) * MAX_ROUNDS,
 ) -> SelectionResult:
-    """Select the most probable set of effects; see `evidence`.
+    """Select the most probable set of effects; see `selection.search_sets`.
 
-    The linear model about a fit ranks all sets; the best are refitted, and ranked again about the
-    best of them, until no other set is more probable and no larger one is to be tried, or all
-    `rounds` are over. `first` is a set to begin with, fitted to another problem.
+    `first` is a set to begin with, fitted to another problem.
     """
     null = problem.fit_effects(start, ())
-    state, refitted = SelectionResult(null, null), {frozenset[str](): null}
     if first is not None:
-        state = replace(state, best=problem.fit_effects(first.add_to(start), first.effects))
-        refitted[frozenset(first.names)] = state.best
-    try:
-        for effort, following in zip_longest(rounds, rounds[1:]):
-            before = state.best
-            closest = min(refitted.values(), key=lambda fitted: fitted.cost)
-            if effort.if_open and problem.leaves_noise(closest):
-                break
-            state = _advance(problem, state, refitted, report, effort)
-            goes_on = following is not None and following.max_effects > effort.max_effects
-            if {*state.best.names} == {*before.names} and not goes_on:
-                break
-        return state
-    except Cancelled:
-        tried = tuple(fitted for names, fitted in refitted.items() if names)
-        best = min((state.best, *tried), key=lambda fitted: fitted.cost)
-        return replace(state, best=best, tried=tried, complete=False)
-
-
-def _advance(
-    problem: SelectionProblem,
-    state: SelectionResult,
-    refitted: dict[frozenset[str], FittedSet],
-    report: ProgressCallback,
-    effort: RoundEffort,
-) -> SelectionResult:
-    """Rank all sets about the base of the best fit so far, and refit the most probable ones."""
-    current = state.best
-    base = current.remove_from(current.fit.parameters)
-    known_shapes = {
-        effect.name: fitted.find_shape(effect)
-        for fitted in (*refitted.values(), current)
-        for effect in fitted.effects
-    }
-    report(SelectionProgress("all effects", best=current))
-    rich = tuple((effect.name, known_shapes[effect.name]) for effect in current.effects)
-    linear = build_evidence(
-        problem.log_residuals, base, problem.library, known_shapes, rich, problem.mapper
-    )
-    promised, share = linear.rank_states(effort.max_effects), effort.share
-    for index in range(1, effort.max_refits + 1):
-        states = _correct_by_refits(linear, promised, refitted, state.null)
-        each = _find_open(linear, states, refitted, share)
-        if each is None:
-            break
-        variants = [linear.variants[c] for c in each.columns]
-        names = tuple(variant.candidate.name for variant in variants)
-        report(SelectionProgress(effort.stage, names, index, effort.max_refits, current))
-        parameters = base
-        for variant, amplitude in zip(variants, linear.estimate(each.columns)[0], strict=True):
-            parameters = variant.add_to(parameters, float(amplitude))
-        effects = tuple(variant.candidate for variant in variants)
-        refitted[frozenset(names)] = fitted = problem.fit_effects(parameters, effects)
-        if share and problem.leaves_noise(fitted):
-            share = 0.0
-    states = _correct_by_refits(linear, promised, refitted, state.null)
-    best = next(refitted[linear.names(each)] for each in states if linear.names(each) in refitted)
-    explanations = tuple(
-        Explanation(tuple(sorted(linear.names(each))), each.place, float(p))
-        for each, p in zip(states, softmax(states), strict=True)
-        if p > MIN_PROBABILITY
-    )
-    tried = tuple(fitted for names, fitted in refitted.items() if names)
-    return replace(state, best=best, tried=tried, explanations=explanations, evidence=linear)
-
-
-def _find_open(
-    linear: LinearEvidence,
-    states: Sequence[Hypothesis],
-    refitted: Mapping[frozenset[str], FittedSet],
-    share: float,
-) -> Hypothesis | None:
-    """Return the most probable state whose set has not been refitted; None if all near ones have.
-
-    More effects that are less probable only add noise to what the best says.
-    """
-    best = states[0]
-    least = best.log_evidence - max(REFIT_NATS, share * abs(best.log_evidence))
-    for each in states:
-        names = linear.names(each)
-        if each.log_evidence < least:
-            break
-        if share and each.place:
-            continue
-        if names not in refitted and not linear.names(best) < names:
-            return each
-    return None
-
-
-def _correct_by_refits(
-    linear: LinearEvidence,
-    states: Sequence[Hypothesis],
-    refitted: Mapping[frozenset[str], FittedSet],
-    null: FittedSet,
-) -> list[Hypothesis]:
-    """Return the states, the most probable first, less what a refit has not kept of its promise.
-
-    What the linear model promises of a set, its refit may not find: an effect vanishes, or removes
-    less. The set then counts by what was found, and so does each larger one that was not refitted.
-    """
-    count = sum(values.size for values in null.held_out)
-    lost: dict[frozenset[str], float] = {}
-    for state in states:
-        names = linear.names(state)
-        if state.columns and names in refitted and names not in lost:
-            promised = linear.measure_gain(state.columns)
-            kept = (null.fit.cost - refitted[names].fit.cost) * count / linear.inflation
-            lost[names] = 0.5 * promised * min(max(1.0 - kept / max(promised, 1e-300), 0.0), 1.0)
-
-    def correct(state: Hypothesis) -> Hypothesis:
-        names = linear.names(state)
-        own = lost.get(names)
-        if own is None:
-            own = max((loss for smaller, loss in lost.items() if smaller <= names), default=0.0)
-        return replace(state, log_evidence=state.log_evidence - own)
-
-    return sorted(map(correct, states), key=lambda state: -state.log_evidence)
+        first = problem.fit_effects(first.add_to(start), first.effects)
+    return search_sets(problem, null, report, first, rounds)

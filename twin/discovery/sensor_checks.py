@@ -15,11 +15,12 @@ from scipy.optimize import least_squares
 from table_io.block import Bool2D, Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
 from twin.compare.spectra import Spectrum
-from twin.discovery.least_squares import INTERVAL_SIGMA, FitResult
+from twin.discovery.least_squares import FitResult
 from twin.discovery.nuisances import list_sizes
 from twin.discovery.parameters import GapKey, NuisanceKey
 from twin.discovery.residuals import LogResiduals
 from twin.discovery.signals import CELL_PAIRS, OPEN_END_S, SENSOR_PAIRS, LogSignals
+from twin.evidence.linear import INTERVAL_SIGMA
 
 STRONG_RATIO = 25.0  # power of a spectral line over its noise: weaker ones are not compared
 # Limits of healthy instruments; see `table_io.sim.imperfections` for sizes in laboratories.

@@ -46,9 +46,10 @@ from twin.discovery.result import (
     Verdict,
     WindowMisfit,
 )
-from twin.discovery.selection import Cancelled, ProgressCallback
+from twin.discovery.selection import ProgressCallback
 from twin.discovery.sensor_checks import check_sensors
 from twin.discovery.symbolic_regression import MISSING_MESSAGE, is_available
+from twin.evidence.selection import Cancelled
 from twin.laws.library import find_effect
 from twin.model.config import ModelConfig
 from twin.recording.reader import read_start
