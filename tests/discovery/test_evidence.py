@@ -14,7 +14,7 @@ from twin.discovery.evidence import build_evidence
 from twin.discovery.law_terms import make_law_candidate
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.evidence.linear import EFFECT_SHARE, LinearEvidence, Variant
+from twin.evidence.linear import EFFECT_SHARE, UNKNOWN_ERROR_SHARE, LinearEvidence, Variant
 from twin.laws.terms import FAMILIES
 
 ENTRIES, FORCE = 400, 100.0
@@ -76,6 +76,18 @@ def test_a_planted_amplitude_is_found_within_its_deviation() -> None:
     (amplitude,), (deviation,) = linear.estimate(best.columns)
     assert abs(amplitude - 0.8) < 3 * deviation
     assert deviation == pytest.approx(1 / np.sqrt(ENTRIES), rel=0.1)
+
+
+@pytest.mark.parametrize(("share", "is_named"), [(0.001, False), (0.01, True)])
+def test_what_unknown_errors_may_imitate_is_no_effect(share: float, is_named: bool) -> None:
+    """Ten times the noise in a record of 10^4: certain by itself, but a tenth of a percent."""
+    columns, noise = draw(3, 3), draw(1, 4)[0]
+    force = 10.0 / 0.001
+    amplitude = share * force / np.linalg.norm(columns[1])
+    sure = replace(build(columns, noise - amplitude * columns[1]), force=force)
+    careful = replace(sure, unknown_share=UNKNOWN_ERROR_SHARE)
+    assert sure.rank_states(2)[0].columns == (1,)
+    assert careful.rank_states(2)[0].columns == ((1,) if is_named else ())
 
 
 def test_chance_is_named_no_more_often_than_stated() -> None:

@@ -3,13 +3,10 @@
     python -m tests.studies.table_effects [CASES] [SEED] [FILE]
 
 Random tables of `tests/earthquakes/planted_tables.py`, one third without an effect, are rehearsed
-and identified; a line of JSON is written for each, and the counts at the end. The limits of
-`twin/earthquakes/table_effects.py` were set on tables of the seeds 100 and 200, not on those of a
-study.
+and identified; a line of JSON is written for each, and the counts at the end.
 """
 
 import json
-import math
 import sys
 import time
 from pathlib import Path
@@ -20,7 +17,7 @@ import numpy as np
 from tests.builders.rigs import compute_oil_column_hz
 from tests.earthquakes.hydraulic_rig import TABLE
 from tests.earthquakes.planted_tables import SIZES, PlantedTable, draw_table, record_rehearsal
-from twin.earthquakes.table_effects import EFFECT_BY_ID, describe_size, discover_table_effects
+from twin.earthquakes.table_evidence import discover_table_effects
 from twin.earthquakes.table_identification import RehearsalProblem, fit_basic_twin
 
 MASS_KG, STALL_N = TABLE.moving_mass_kg, 42_000.0
@@ -56,16 +53,22 @@ def run_case(table: PlantedTable) -> dict[str, Any]:
     basic = fit_basic_twin(problem)
     fitted_s = time.process_time() - begin
     discovery = discover_table_effects(basic)
-    parameters, widths = discovery.fit.parameters, discovery.fit.estimate_half_widths()
+    verdict = discovery.verdict
+    parameters, widths = (
+        discovery.fitted.fit.parameters,
+        discovery.fitted.fit.estimate_half_widths(),
+    )
     planted = {key: float(table.hydraulic[key]) for key in SIZES.get(table.effect, {})}
     return {
         "effect": table.effect,
         "planted": planted,
-        "named": [finding.id for finding in discovery.findings],
-        "undecided": [finding.undecided for finding in discovery.findings],
-        "sizes": [describe_size(EFFECT_BY_ID[f.id], parameters) for f in discovery.findings],
-        "gaps": [math.sqrt(basic.cost), discovery.gap],
-        "closest": discovery.closest and discovery.closest.id,
+        "outcome": verdict.outcome,
+        "probability": verdict.confidence,
+        "place": verdict.place,
+        "named": [*verdict.best.names],
+        "alternatives": [other.names for other in verdict.alternatives],
+        "sizes": [getattr(parameters, each.amplitude.name) for each in verdict.best.effects],
+        "gaps": [discovery.basic.gap, discovery.fitted.gap],
         "errors_in_half_widths": {
             name: (getattr(parameters, name) - true) / widths[name]
             for name, true in find_truth(table).items()

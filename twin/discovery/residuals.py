@@ -35,6 +35,8 @@ from twin.discovery.motion import (
 from twin.discovery.noise import BAND_COUNT, number_bands
 from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet
 from twin.discovery.signals import LogSignals, derives_acc
+from twin.evidence.linear import UNKNOWN_ERROR_SHARE
+from twin.evidence.verdict import MAX_LEVEL
 from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
 
@@ -54,11 +56,8 @@ PULL_ROWS = ("right pull", "left pull")
 PULLING_CELLS = {"right pull": "right cells", "left pull": "left cells"}
 # of the largest contact force: undershoot of the low pass after a release
 MAX_UNDERSHOOT_SHARE = 0.005
-# Of the force, rms: errors of instruments that no nuisance has the form of.
-UNKNOWN_ERROR_SHARE = 0.002
 # Of the force of a law, rms: what its form in the library leaves of that of a specimen.
 FORM_ERROR_SHARE = 0.02
-MAX_LEVEL = 1.5  # mean square over the noise that may remain where the residual is said to be noise
 MIN_CHANGES = 8  # values of a step that show the noise
 CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far

@@ -12,11 +12,12 @@ from twin.discovery.candidates import Candidate
 from twin.discovery.evidence import build_evidence
 from twin.discovery.least_squares import FitResult, MapFunction, fit_with_misfit
 from twin.discovery.parameters import ParameterSet
-from twin.discovery.residuals import MAX_LEVEL, LogResiduals, measure_level
+from twin.discovery.residuals import LogResiduals, measure_level
 from twin.discovery.units import assign_folds
 from twin.evidence import selection
 from twin.evidence.linear import LinearEvidence, Variant
 from twin.evidence.selection import MAX_ROUNDS, RoundEffort, search_sets
+from twin.evidence.verdict import MAX_LEVEL
 
 MIN_VISIBLE_EXCESS = 0.05  # of the floor: excess below which there is no gap
 MIN_GAIN_SIGMA = 4.0  # standard errors by which a gain must exceed zero

@@ -12,8 +12,9 @@ import numpy as np
 from table_io.block import Float1D, Float2D
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
+from twin.evidence.linear import CROSSED_HATS, HATS, list_hats
 
-HATS, CROSSED_HATS, DEPTH_HATS = 9, 5, 6
+DEPTH_HATS = 6
 
 
 def compute_stranger_forces(
@@ -27,14 +28,14 @@ def compute_stranger_forces(
     def damper(values: Float1D) -> Float2D:
         return np.array([values, nothing, nothing])
 
-    slow_u, slow_v = _list_hats(u, CROSSED_HATS), _list_hats(v, CROSSED_HATS)
+    slow_u, slow_v = list_hats(u, CROSSED_HATS), list_hats(v, CROSSED_HATS)
     t = (m.time_s - m.time_s[0]) / max(float(np.ptp(m.time_s)), 1e-9)
     places = {
-        "spring of the damper": [damper(hat) for hat in _list_hats(u, HATS)],
-        "damping of the damper": [damper(hat) for hat in _list_hats(v, HATS)],
+        "spring of the damper": [damper(hat) for hat in list_hats(u, HATS)],
+        "damping of the damper": [damper(hat) for hat in list_hats(v, HATS)],
         "damper": [
-            *(damper(hat) for hat in _list_hats(u, HATS)),
-            *(damper(hat) for hat in _list_hats(v, HATS)),
+            *(damper(hat) for hat in list_hats(u, HATS)),
+            *(damper(hat) for hat in list_hats(v, HATS)),
             *(damper(hat * v) for hat in slow_u),
             *(damper(hat * u) for hat in slow_v),
         ],
@@ -55,7 +56,7 @@ def compute_stranger_forces(
             forces[1 + row] = np.where(where, values, 0.0)
             return forces
 
-        hats = _list_hats(2.0 * np.minimum(depth, 1.0) - 1.0, DEPTH_HATS)
+        hats = list_hats(2.0 * np.minimum(depth, 1.0) - 1.0, DEPTH_HATS)
         own = [*(push(hat) for hat in hats), *(push(hat * rate) for hat in hats[::2])]
         places["bumpers"] = [np.array(column) for column in _join(places.get("bumpers"), own)]
         places["bumpers over time"] = [
@@ -68,12 +69,3 @@ def compute_stranger_forces(
 def _join(first: list[Float2D] | None, second: list[Float2D]) -> list[Float2D]:
     """Return columns of both sides: each its own."""
     return second if first is None else [*first, *second]
-
-
-def _list_hats(x: Float1D, count: int) -> list[Float1D]:
-    """Return hat functions over -1 to 1 of a series, (sample,) each."""
-    knots = np.linspace(-1.0, 1.0, count)
-    width = knots[1] - knots[0]
-    return [
-        np.clip(1.0 - np.abs(np.clip(x, -1.0, 1.0) - knot) / width, 0.0, None) for knot in knots
-    ]

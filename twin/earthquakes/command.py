@@ -22,7 +22,8 @@ from twin.earthquakes.spectrum_record import (
     SpectrumRecordOptions,
     compute_spectrum_records,
 )
-from twin.earthquakes.table_effects import LIBRARY, describe_discovery
+from twin.earthquakes.table_effects import LIBRARY
+from twin.earthquakes.table_evidence import describe_discovery
 from twin.earthquakes.table_identification import TableIdentification
 from twin.earthquakes.table_model import TableParameters
 from twin.earthquakes.task import (

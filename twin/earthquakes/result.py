@@ -20,7 +20,8 @@ from table_io.config.excitation.drive_file import DriveHeader, ExpectedResponse,
 from table_io.config.profile import Profile
 from table_io.config.provenance import Provenance, require_seal, seal_text
 from table_io.errors import InputError, suggest
-from twin.earthquakes.table_effects import EFFECT_BY_ID, EffectDiscovery
+from twin.earthquakes.table_effects import EFFECT_BY_ID
+from twin.earthquakes.table_evidence import EffectDiscovery
 from twin.earthquakes.table_identification import TableIdentification, TableRehearsal
 from twin.earthquakes.table_model import TableModel, TableParameters
 from twin.earthquakes.table_response import (
@@ -92,6 +93,14 @@ class Judgement(ConfigModel):
         return f"the twin loses to a baseline ({'; '.join(parts)})" if parts else ""
 
 
+class EffectVerdict(ConfigModel):
+    """Verdict on the effects of a table's library: by the evidence that judges a specimen."""
+
+    outcome: str = Field(description="none, named, ambiguous or unexplained.")
+    probability: NonNegative = Field(description="Probability of the outcome.")
+    place: str = Field("", description="Place of what no effect explains.")
+
+
 class TableTwinReport(ConfigModel):
     """What `table-twin --json` prints."""
 
@@ -127,6 +136,7 @@ class TableTwinConfig(ConfigModel):
     parameters: dict[str, float] = Field({}, description="Parameters of the hydraulic twin, SI.")
     half_widths: dict[str, float] = Field({}, description="Half widths of their 95 % intervals.")
     effects: tuple[str, ...] = Field((), description="Effects that the rehearsal showed.")
+    effect_verdict: EffectVerdict | None = Field(None, description="What is known of them.")
     provenance: Provenance | None = Field(
         None, description="Rig, specimen, level and recording that it was identified from."
     )
@@ -214,8 +224,8 @@ class TableTwinResult:
 
     def format_toml(self) -> str:
         """Return the text of the twin's file."""
-        model = self.model
-        text = {
+        model, discovery = self.model, self.discovery
+        text: dict[str, object] = {
             "title": self.title,
             "mass_kg": self.mass_kg,
             "residual": float(f"{self.residual:.4g}"),
@@ -223,14 +233,20 @@ class TableTwinResult:
         }
         if self.identification is not None and isinstance(model, TableModel):
             values, widths = model.parameters._asdict(), self.identification.half_widths
-            discovery = self.discovery
             text |= {
-                "effects": [finding.id for finding in discovery.findings] if discovery else [],
+                "effects": [*discovery.fitted.names] if discovery else [],
                 "parameters": {name: float(f"{value:.9g}") for name, value in values.items()},
                 "half_widths": {name: float(f"{width:.3g}") for name, width in widths.items()},
             }
         elif isinstance(model, ResponseModel):
             text["response"] = _describe_response(model).model_dump(exclude_none=True)
+        if discovery is not None:
+            verdict = discovery.verdict
+            text["effect_verdict"] = EffectVerdict(
+                outcome=verdict.outcome,
+                probability=float(f"{verdict.confidence:.4g}"),
+                place=verdict.place,
+            ).model_dump()
         text["judgement"] = self.judgement.model_dump(exclude_none=True)
         text["provenance"] = self.provenance.model_dump()
         return seal_text(format_toml(text))

@@ -25,6 +25,9 @@ LOWEST_HZ, HIGHEST_HZ = 0.2, 45.0  # of the fit
 MIN_DURATION_S = 10.0
 CONFIDENCE_LEVEL = 0.95  # of the intervals
 RESIDUAL_RATE_RATIO = 2.2  # of the residuals over the highest frequency
+MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler twin is not worse up to this
+WHITENING_HZ = 2.0  # over which the power of the residuals is smoothed
+WHITENING_FLOOR = 0.01  # of its largest value: less is not weighted up further
 BLOCK_S, MIN_BLOCKS = 2.5, 8  # of time that is left out together
 DIFFERENCE_STEP = 2e-3  # of a parameter, or of its typical value if that is larger
 # Starting value, smallest and largest value of each parameter that is fitted.
@@ -192,6 +195,23 @@ class RehearsalProblem:
                 self.compute_residuals(build_parameters(tuple(scaled_values), values, self))
             )
         )
+
+    def whiten(self, fit: "TableFit") -> "RehearsalProblem":
+        """Return the problem with weights by which what a fit leaves of it is white.
+
+        Then its residuals are independent, as if they were noise of one size.
+        """
+        power = np.abs(np.fft.rfft(fit.residuals[:-1])) ** 2
+        first, count = int(np.flatnonzero(self.used)[0]), int(self.used.sum())
+        seconds = self.motion.command_m.size / self.motion.rate_hz
+        width = min(max(round(WHITENING_HZ * seconds), 1), count)
+        around = np.ones(width)
+        smooth = np.convolve(power[first : first + count], around, mode="same")
+        smooth /= np.convolve(np.ones(count), around, mode="same")
+        factor = np.maximum(smooth, WHITENING_FLOOR * smooth.max()) ** -0.5
+        factor /= float(np.linalg.norm(self.measured * factor) / np.linalg.norm(self.measured))
+        whitened = replace(self, weights=self.weights * factor, measured=self.measured * factor)
+        return whitened.with_noise_of(fit)
 
     def with_noise_of(self, fit: "TableFit") -> "RehearsalProblem":
         """Return the problem with the size of the residuals that a fit leaves."""

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy import signal
 
-from table_io.block import Float1D
+from table_io.block import Float1D, Int1D
 from table_io.errors import InputError
 from twin.compare.quality import find_bad_samples
 from twin.earthquakes.result import HYDRAULIC, ChannelEstimate, JudgedErrors, JudgedRun, Judgement
@@ -22,6 +22,7 @@ from twin.earthquakes.table_effects import LIBRARY
 from twin.earthquakes.table_identification import (
     BOUNDS,
     HIGHEST_HZ,
+    MAX_WORSE_RATIO,
     MIN_DURATION_S,
     TableFit,
     TableRehearsal,
@@ -53,7 +54,7 @@ MAX_FOREIGN_SHARE = 0.5  # of the power of the table's acceleration that is not 
 RESONANT_WIDTH_HZ = 0.5  # on either side of a peak that is no command's
 MAX_HYDRAULIC_S = 180.0  # of logs to which the hydraulic table is fitted, at half a second each
 PART_COUNT = 4  # of a single log, that are left out in turn
-MAX_WORSE_RATIO = 1.02  # of held-out errors: a simpler structure is not worse up to this
+PIECE_COUNT = 4  # of each of them, whose scatter says how sure a gain is
 MIN_CORRELATION = 0.7  # of channels of one motion, by size: less says nothing of sign and lag
 MAX_LAG_S, SEARCHED_LAG_S = 0.5, 5.0  # of a slow table, and of a log on two clocks
 GAIN_LIMITS = 0.2, 5.0  # of displacement over command
@@ -266,8 +267,7 @@ def prepare_data(logs: Sequence[NamedMotion], band_hz: tuple[float, float]) -> l
         measured = projection.to_rows(spectrum)
         part = np.full(measured.size, number)
         if len(logs) == 1:
-            energy = np.cumsum(measured**2)
-            part = np.minimum((PART_COUNT * energy / energy[-1]).astype(int), PART_COUNT - 1)
+            part = _cut_by_energy(measured, PART_COUNT)
         data.append(ResponseData(projection, motion.command_m, spectrum, part, log.channels))
     return data
 
@@ -321,10 +321,41 @@ def try_hydraulic_fit(
     return StructureTrial(HYDRAULIC, model, tuple(left), measure_held_out(left, data))
 
 
-def choose_structure(trials: Sequence[StructureTrial]) -> StructureTrial:
-    """Return the simplest structure that is not worse on held-out time than the best."""
-    best = min(trial.error for trial in trials)
-    return next(trial for trial in trials if trial.error <= MAX_WORSE_RATIO * best)
+def choose_structure(
+    trials: Sequence[StructureTrial], data: Sequence[ResponseData]
+) -> StructureTrial:
+    """Return the simplest structure that is not worse on held-out time than the best.
+
+    Of those that gain on the delay in every part that was left out, by more than the standard error
+    of that gain: what helps in some of its own parts only promises nothing for another run.
+    """
+    delay = next(trial for trial in trials if trial.id == "pure_delay")
+    kept = [trial for trial in trials if trial is delay or _gains_everywhere(trial, delay, data)]
+    best = min(trial.error for trial in kept)
+    return next(trial for trial in kept if trial.error <= MAX_WORSE_RATIO * best)
+
+
+def _gains_everywhere(
+    trial: StructureTrial, delay: StructureTrial, data: Sequence[ResponseData]
+) -> bool:
+    """Return True if a structure leaves less than the delay of each part, by a standard error.
+
+    It is that of the sum over PIECE_COUNT pieces of the part, of equal energy, by their scatter.
+    """
+    for own, left, late in zip(data, trial.held_out, delay.held_out, strict=True):
+        for part in np.unique(own.part):
+            rows = own.part == part
+            piece = _cut_by_energy(own.measured[rows], PIECE_COUNT)
+            gains = np.bincount(piece, (late**2 - left**2)[rows], PIECE_COUNT)
+            if not gains.sum() > math.sqrt(PIECE_COUNT) * gains.std(ddof=1):
+                return False
+    return True
+
+
+def _cut_by_energy(measured: Float1D, count: int) -> Int1D:
+    """Return the number of each row, (row,), in so many stretches of equal energy."""
+    energy = np.cumsum(measured**2)
+    return np.minimum((count * energy / energy[-1]).astype(int), count - 1)
 
 
 def join_motions(logs: Sequence[NamedMotion]) -> TableRehearsal | None:

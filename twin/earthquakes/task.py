@@ -32,7 +32,7 @@ from twin.earthquakes.result import (
     TableTwinResult,
     load_table_twin,
 )
-from twin.earthquakes.table_effects import discover_table_effects
+from twin.earthquakes.table_evidence import discover_table_effects
 from twin.earthquakes.table_identification import (
     HIGHEST_HZ,
     RehearsalProblem,
@@ -123,10 +123,10 @@ def identify_table(
         hydraulic = fit_basic_twin(problem)
         if options.with_effects:
             discovery = discover_table_effects(hydraulic, report)
-            hydraulic = discovery.fit
+            hydraulic = discovery.fitted.fit
         # Before the frequency response: of equal errors, physical parameters are worth more.
         trials.insert(2, try_hydraulic_fit(hydraulic, logs, data))
-    chosen = choose_structure(trials)
+    chosen = choose_structure(trials, data)
     fitted_table = hydraulic if chosen.id == HYDRAULIC else None
     judged_data = prepare_data(judges, band_hz)
     judgement = (

@@ -28,11 +28,13 @@ from scipy.sparse import csr_array
 from table_io.block import Float1D, Float2D, Int1D
 
 INTERVAL_SIGMA = 1.96  # standard deviations either side: 95 %
+UNKNOWN_ERROR_SHARE = 0.002  # of the force, rms: errors of instruments of no form that is known
 EFFECT_SHARE = 0.1  # standard deviation of an effect's force over that of the record, before a test
 STRANGER_SHARES = (0.003, 0.01, 0.03, 0.1)  # the same for the stranger, each as likely
 # Probabilities before a test: of no effect, one, two and three, and of a stranger beside them.
 SET_PRIORS = (0.5, 0.3, 0.15, 0.05)
 STRANGER_PRIOR = 0.2
+HATS, CROSSED_HATS = 9, 5  # of a stranger over one quantity, and where it has a product
 PAIR_STARTS, TRIPLE_STARTS, STRANGER_STARTS = 40, 12, 12  # sets that are extended
 RICHEST_EFFECTS = 3  # beside the stranger, in the model that shows the noise
 MIN_BASE_SHARE = 1e-12  # of the curvature of the base: directions with less are left out
@@ -79,7 +81,9 @@ class Hypothesis:
 class LinearEvidence(Generic[C]):
     """Linear model about a fit: products after the base has been absorbed.
 
-    `products` (column, column) and `scores` (column,) of candidates and stranger, over the noise,
+    With an `unknown_share` even the null has each effect, with that standard deviation of its force
+    over that of the record: errors of no known form imitate as much of any effect. `products`
+    (column, column) and `scores` (column,) of candidates and stranger, over the noise,
     and the `covariance` of the scores; `scale` are the norms of the columns as they are.
     """
 
@@ -92,6 +96,7 @@ class LinearEvidence(Generic[C]):
     force: float  # norm of the measured forces
     inflation: float  # of the covariance of the scores, which holds it
     level: float  # mean square over noise and unknown errors that the richest model leaves
+    unknown_share: float = 0.0
 
     @cached_property
     def _precision(self) -> Float1D:
@@ -111,6 +116,14 @@ class LinearEvidence(Generic[C]):
             for share in STRANGER_SHARES
         ]
         return float(np.logaddexp.reduce(evidences)) - math.log(len(evidences))
+
+    def _compare(self, sets: Int1D, precision: Float2D) -> tuple[Float1D, Float2D, Float2D]:
+        """Return what `_weigh` does, with the evidence over that of unknown errors alone."""
+        evidence, amplitudes, deviations = self._weigh(sets, precision)
+        if self.unknown_share:
+            known = (EFFECT_SHARE / self.unknown_share) ** 2 * self._precision[sets]
+            evidence = evidence - self._weigh(sets, known)[0]
+        return evidence, amplitudes, deviations
 
     def _inform(self, sets: Int1D) -> tuple[Float2D, Float2D]:
         """Return (information I (set, column, column), g (set, column)) of sets of columns."""
@@ -135,7 +148,7 @@ class LinearEvidence(Generic[C]):
     def _measure(self, columns: Sequence[int], precision: Float1D) -> float:
         if not columns:
             return 0.0
-        return float(self._weigh(np.array([columns]), precision[None, :])[0][0])
+        return float(self._compare(np.array([columns]), precision[None, :])[0][0])
 
     def estimate(self, columns: Sequence[int]) -> tuple[Float1D, Float1D]:
         """Return (amplitudes, their standard deviations) of a set, (column,) each."""
@@ -228,7 +241,7 @@ class LinearEvidence(Generic[C]):
         if not sets:
             return []
         table = np.array(sets)
-        evidence, amplitudes, deviations = self._weigh(table, self._precision[table])
+        evidence, amplitudes, deviations = self._compare(table, self._precision[table])
         signs = np.array([variant.sign for variant in self.variants])[table]
         allowed = (signs * amplitudes >= -deviations).all(axis=1)
         prior = self.log_prior(table.shape[1], False)
@@ -251,6 +264,7 @@ class LinearEvidence(Generic[C]):
 def absorb_base(
     columns: Float2D, noise: Float2D, base: int, unit: Int1D, variants: tuple[Variant[C], ...],
     places: dict[str, Int1D], force: float, rich: Sequence[int], expected: Float1D,
+    unknown_share: float = 0.0,
 ) -> LinearEvidence[C]:  # fmt: skip
     """Return the linear model; `columns` are those of base, candidates, stranger, and the residual.
 
@@ -292,7 +306,7 @@ def absorb_base(
     }
     return LinearEvidence(
         variants, places, _make_positive(products), covariance, scores, usable, force, inflation,
-        level,
+        level, unknown_share,
     )  # fmt: skip
 
 
@@ -350,3 +364,12 @@ def softmax(states: Sequence[Hypothesis]) -> Float1D:
     """Return the probability of each state, (state,)."""
     logs = np.array([state.log_evidence for state in states])
     return np.exp(logs - np.logaddexp.reduce(logs))
+
+
+def list_hats(x: Float1D, count: int) -> list[Float1D]:
+    """Return hat functions over -1 to 1 of a series, (sample,) each."""
+    knots = np.linspace(-1.0, 1.0, count)
+    width = knots[1] - knots[0]
+    return [
+        np.clip(1.0 - np.abs(np.clip(x, -1.0, 1.0) - knot) / width, 0.0, None) for knot in knots
+    ]

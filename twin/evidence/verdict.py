@@ -14,6 +14,7 @@ from twin.evidence.linear import C
 from twin.evidence.selection import Explanation, F, Problem, Selection
 
 CERTAIN_PROBABILITY = 0.95  # of a set of effects that is named; with less, others are told too
+MAX_LEVEL = 1.5  # mean square over the noise that may remain where a residual is said to be noise
 EXCLUDED_PROBABILITY = 0.01  # of an explanation: with less it is excluded
 
 
