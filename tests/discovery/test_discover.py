@@ -30,7 +30,7 @@ from twin.discovery.sensor_checks import check_sensors
 from twin.discovery.units import assign_folds
 from twin.discovery.verdict import closed_fraction
 from twin.evidence.selection import Cancelled, Explanation
-from twin.evidence.verdict import Verdict, judge_selection
+from twin.evidence.verdict import SelectionVerdict, judge_selection
 from twin.laws.library import EFFECTS
 
 # What is left out where the library is not the subject: with the whole of it, it takes long.
@@ -267,7 +267,9 @@ def test_what_all_probable_sets_share_is_named() -> None:
     sets = [replace(named.best, effects=(*named.best.effects, effect)) for effect in some]
     tried = (named.best, *sets)
 
-    def judge(fitted: Sequence[FittedSet], probabilities: Sequence[float]) -> Verdict[FittedSet]:
+    def judge(
+        fitted: Sequence[FittedSet], probabilities: Sequence[float]
+    ) -> SelectionVerdict[FittedSet]:
         explanations = tuple(
             Explanation(tuple(sorted(each.names)), "", probability)
             for each, probability in zip(fitted, probabilities, strict=True)

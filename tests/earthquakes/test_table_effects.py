@@ -48,7 +48,7 @@ from twin.earthquakes.table_identification import (
     fit_table,
 )
 from twin.earthquakes.table_model import TableModel, TableParameters
-from twin.evidence.verdict import Verdict
+from twin.evidence.verdict import SelectionVerdict
 
 MASS_KG = TABLE.moving_mass_kg
 BASIC = TableParameters(
@@ -338,7 +338,7 @@ def test_a_named_effect_is_described_with_equation_and_source() -> None:
         parameters=BASIC._replace(backlash_m=5e-5),
     )
     best: Any = SimpleNamespace(effects=(EFFECT_BY_ID["backlash"],), fit=fit, gap=0.05)
-    verdict = Verdict("named", best, 0.99, 0.99, (), False, "", "")
+    verdict = SelectionVerdict("named", best, 0.99, 0.99, (), False, "", "")
     without: Any = SimpleNamespace(gap=0.1)
     discovery: Any = SimpleNamespace(verdict=verdict, basic=without, fitted=best)
     lines = describe_discovery(discovery)

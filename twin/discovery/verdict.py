@@ -16,12 +16,12 @@ from twin.discovery.parameters import (
     is_correction,
 )
 from twin.discovery.selection import MIN_VISIBLE_EXCESS, FittedSet, SelectionResult
-from twin.evidence.verdict import Verdict
+from twin.evidence.verdict import SelectionVerdict
 from twin.laws.library import EFFECTS, load_plugins
 
 
 @dataclass(frozen=True, eq=False)
-class DiscoveryVerdict(Verdict[FittedSet]):
+class DiscoveryVerdict(SelectionVerdict[FittedSet]):
     """Verdict on a specimen, with the numbers behind it (mean squares over the noise)."""
 
     floor: float
@@ -31,7 +31,7 @@ class DiscoveryVerdict(Verdict[FittedSet]):
     form_errors: Mapping[ParameterKey, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, verdict: Verdict[FittedSet], floor: float) -> "DiscoveryVerdict":
+    def of(cls, verdict: SelectionVerdict[FittedSet], floor: float) -> "DiscoveryVerdict":
         """Return a verdict with the mean square that noise alone leaves, over the noise."""
         own = {each.name: getattr(verdict, each.name) for each in fields(verdict)}
         return cls(**own, floor=floor)

@@ -36,7 +36,7 @@ from twin.evidence.linear import (
     list_hats,
 )
 from twin.evidence.selection import RoundEffort, Selection, SelectionProgress, search_sets
-from twin.evidence.verdict import MAX_LEVEL, Verdict, judge_selection
+from twin.evidence.verdict import MAX_LEVEL, SelectionVerdict, judge_selection
 from twin.system.process_pool import map_in_threads
 
 MAX_EFFECTS, MAX_ROUNDS, MAX_REFITS = 2, 3, 3
@@ -259,7 +259,7 @@ class EffectDiscovery:
     """
 
     selection: Selection[FittedTable, TableEffect]
-    verdict: Verdict[FittedTable]
+    verdict: SelectionVerdict[FittedTable]
     basic: FittedTable
     fitted: FittedTable
 

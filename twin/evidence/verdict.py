@@ -19,7 +19,7 @@ EXCLUDED_PROBABILITY = 0.01  # of an explanation: with less it is excluded
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict(Generic[F]):
+class SelectionVerdict(Generic[F]):
     """Verdict with the sets of effects behind it."""
 
     outcome: str
@@ -45,7 +45,9 @@ class JudgedProblem(Problem[F, C], Protocol[F, C]):
         ...
 
 
-def judge_selection(problem: JudgedProblem[F, C], selection: Selection[F, C]) -> Verdict[F]:
+def judge_selection(
+    problem: JudgedProblem[F, C], selection: Selection[F, C]
+) -> SelectionVerdict[F]:
     """Judge the outcome of a selection."""
     best, null = selection.best, selection.null
     by_set = sum_by_set(selection.explanations)
@@ -60,9 +62,9 @@ def judge_selection(problem: JudgedProblem[F, C], selection: Selection[F, C]) ->
     def conclude(
         outcome: str, fitted: F, probability: float, reason: str,
         alternatives: tuple[F, ...] = (), effects_confidence: float | None = None,
-    ) -> Verdict[F]:  # fmt: skip
+    ) -> SelectionVerdict[F]:  # fmt: skip
         of_effects = probability if effects_confidence is None else effects_confidence
-        return Verdict(
+        return SelectionVerdict(
             outcome, fitted, probability, of_effects, alternatives, has_remainder, reason,
             place if has_remainder else "",
         )  # fmt: skip
