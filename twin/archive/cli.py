@@ -116,8 +116,8 @@ def fleet_command(
     scheduler: SchedulerOption = "",
 ) -> None:
     """Run a command on many recordings, on all cores or a cluster, into one table; resumable."""
+    from twin.archive.command import print_fleet
     from twin.archive.fleet import FleetOptions
-    from twin.archive.fleet_command import print_fleet
 
     options = FleetOptions(
         task.value, tuple(places), where, model, out, workers, scheduler, resume, since

@@ -1,4 +1,4 @@
-"""`catalog`, `runs` and `note`: call their tasks, print what came of them."""
+"""`catalog`, `runs`, `note` and `fleet`: call their tasks, print what came of them."""
 
 import json
 from collections.abc import Sequence
@@ -10,9 +10,12 @@ from rich.text import Text
 from table_io.clock import RealClock
 from table_io.errors import replace_escapes
 from twin.archive.catalog import update_catalog
+from twin.archive.fleet import TABLE_FILE, FleetOptions, run_fleet
 from twin.archive.notes import note_run
 from twin.archive.query import index_runs
 from twin.archive.run_row import COLUMN_TYPES, NUMBER_TYPE, RunRow, replace_nonfinite
+from twin.system.exit_codes import EXIT_GAPS, EXIT_INTERRUPTED
+from twin.system.grid import watch_on_terminal
 from twin.system.terminal import (
     VERDICT_COLOURS,
     catch_interrupts,
@@ -25,6 +28,29 @@ COLOURS = VERDICT_COLOURS | {"complete": "green", "stopped": "yellow"}
 MAX_LISTED = 10  # runs with a problem
 POLL_S = 0.2  # within which Ctrl-C ends the page
 PROGRESS_RUNS = 100  # between lines
+
+MAX_FLEET_LISTED = 20  # failures, and changes; all of them are in the tables
+
+
+def print_fleet(options: FleetOptions) -> int:
+    """Run a fleet, print its table, failures and changes; return the exit code."""
+    with watch_on_terminal("stopping after the logs in progress") as watch:
+        fleet = run_fleet(options, watch)
+    for failed in fleet.failures[:MAX_FLEET_LISTED]:
+        print_line(f"failed: {failed.log}: {failed.failure}")
+    for change in fleet.changes[:MAX_FLEET_LISTED]:
+        print_line(f"changed: {change.log}: {change.column} {change.before} -> {change.after}")
+    state = "complete"
+    if not fleet.is_complete:
+        state = f"stopped ({fleet.stop_reason}); continue with --resume"
+    changes = "" if options.since is None else f", {len(fleet.changes)} values changed"
+    print_line(
+        f"{len(fleet.results)} of {fleet.total} logs, {len(fleet.failures)} failed{changes}, "
+        f"{state} -> {fleet.folder / TABLE_FILE}"
+    )
+    if not fleet.is_complete:
+        return EXIT_INTERRUPTED
+    return EXIT_GAPS if fleet.failures else 0
 
 
 def print_catalog(folders: Sequence[Path], out: Path | None) -> None:
