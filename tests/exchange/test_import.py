@@ -1,5 +1,6 @@
 """A table of samples becomes a log: what our own run says of itself comes out of its CSV again."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -228,6 +229,23 @@ def test_import_table_without_a_profile_warns_and_has_its_curve(
         0, bare_size, bare.start.channels,
     )  # fmt: skip
     assert "no --profile" not in read_warnings(run[1])
+
+
+def test_mass_and_gap_are_stated_without_a_profile_or_in_it(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    export_log(ExportOptions(run[1].path, ("csv",), tmp_path / "out"))
+    stated = ImportOptions(settings={"mass_kg": 12.5, "gap_mm": 3.0}, accept=True)
+    import_table(tmp_path / "out.csv", tmp_path / "bare.mcap", stated)
+    bare = read_recording(tmp_path / "bare.mcap")
+    specimen = read_recorded_config(bare).profile.specimen
+    assert (specimen.mass_kg, specimen.gaps_m) == (12.5, (0.0015, 0.0015))
+    assert "12.5 kg, a gap of 3 mm, a placeholder model" in read_warnings(bare)
+    with raises_input_error(key="gap_mm", value=3.0, problem="the profile states the gap"):
+        import_table(
+            tmp_path / "out.csv", tmp_path / "both.mcap",
+            replace(stated, settings={"gap_mm": 3.0}, profile=run[0] / "quick.toml"),
+        )  # fmt: skip
 
 
 def test_import_table_prefers_labels_to_detected_steps(

@@ -70,6 +70,10 @@ def import_command(
     mass: Annotated[
         float | None, typer.Option("--mass", metavar="KG", help="Moving mass, without a profile.")
     ] = None,
+    gap: Annotated[
+        float | None,
+        typer.Option("--gap", metavar="MM", help="Gap of the bumpers, without a profile."),
+    ] = None,
     rate: Annotated[
         float | None,
         typer.Option("--rate", metavar="HZ", help="Sampling rate of a file without times."),
@@ -105,8 +109,8 @@ def import_command(
     from twin.exchange.import_table import ImportOptions
 
     stated = {
-        "mass_kg": mass, "rate_hz": rate, "from_s": from_s, "to_s": to_s, "detrend": detrend,
-        "rest": rest, "integrate_hz": parse_band(integrate),
+        "mass_kg": mass, "gap_mm": gap, "rate_hz": rate, "from_s": from_s, "to_s": to_s,
+        "detrend": detrend, "rest": rest, "integrate_hz": parse_band(integrate),
     }  # fmt: skip
     options = ImportOptions(
         profile=profile,

@@ -90,6 +90,7 @@ class ColumnMap(ConfigModel):
     group: str = Field("", description="Group, structure or folder inside the file.")
     rate_hz: Positive | None = Field(None, description="Sampling rate of a file without times.")
     mass_kg: Positive | None = Field(None, description="Moving mass; a component test has none.")
+    gap_mm: Finite | None = Field(None, description="Gap of the bumpers; none without bumpers.")
     from_s: Finite | None = Field(None, description="First time of the file that is imported.")
     to_s: Finite | None = Field(None, description="Last time of the file that is imported.")
     rest: bool | None = Field(

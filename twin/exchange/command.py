@@ -208,8 +208,8 @@ def _format_settings(settings: Mapping[str, Any]) -> list[str]:
     """Return the command-line options of settings of a map."""
     words: list[str] = []
     for key, option in (
-        ("rate_hz", "--rate"), ("mass_kg", "--mass"), ("from_s", "--from"), ("to_s", "--to"),
-        ("detrend", "--detrend"),
+        ("rate_hz", "--rate"), ("mass_kg", "--mass"), ("gap_mm", "--gap"), ("from_s", "--from"),
+        ("to_s", "--to"), ("detrend", "--detrend"),
     ):  # fmt: skip
         if key in settings:
             value = settings[key]

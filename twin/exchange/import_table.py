@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ from twin.setup.warm_up import compile_kernels
 from twin.transport.codec import Item
 
 NO_PROFILE = (
-    "warning: no --profile: {mass}, no bumpers, a placeholder model; PRC and twin are "
+    "warning: no --profile: {mass}, {bumpers}, a placeholder model; PRC and twin are "
     "meaningless, give --profile"
 )
 MOTION_CHANNELS = (
@@ -58,7 +58,7 @@ notes = {notes}
 rig = {rig}
 [specimen]
 mass_kg = {mass_kg!r}
-gap_mm = inf
+gap_mm = {gap_mm!r}
 [acquisition]
 rate_hz = {rate_hz!r}
 [sweep]
@@ -68,7 +68,7 @@ step_hz = {hz!r}
 cycles = {cycles}
 measured_cycles = {measured}
 """
-UNIT_MASS_NOTE = "No mass was given: a unit mass without bumpers, so a force is one per unit mass."
+NO_PROFILE_NOTE = "Imported without a profile: {mass}, {bumpers}."
 PLAIN_MODEL = """\
 title = "Placeholder: {hz:.3g} Hz, 5 % damping; the specimen is unknown, give --model"
 [base]
@@ -134,6 +134,24 @@ class ImportOptions:
 
 
 @dataclass(frozen=True)
+class _StatedSpecimen:
+    """What is stated of a specimen without a profile."""
+
+    mass_kg: float | None = None
+    gap_mm: float | None = None
+
+    @classmethod
+    def from_map(cls, column_map: ColumnMap | None) -> "_StatedSpecimen":
+        return cls() if column_map is None else cls(column_map.mass_kg, column_map.gap_mm)
+
+    def describe(self) -> dict[str, str]:
+        """Return the words for mass and bumpers."""
+        mass = "unit mass" if self.mass_kg is None else f"{self.mass_kg:g} kg"
+        bumpers = "no bumpers" if self.gap_mm is None else f"a gap of {self.gap_mm:g} mm"
+        return {"mass": mass, "bumpers": bumpers}
+
+
+@dataclass(frozen=True)
 class Imported:
     """New log of an import: its samples and channels, gaps, and what was decided on the way."""
 
@@ -167,8 +185,8 @@ def import_table(
     is_mapped = options.columns is not None or options.accept
     samples = read_samples(table, column_map, known, leave_out=is_mapped)
     file_labels = read_labels(table, samples) if samples.labels else None
-    mass_kg = column_map.mass_kg if column_map is not None else None
-    config = _build_run_config(table, options, rig_toml, samples.rate_hz, file_labels, mass_kg)
+    specimen = _StatedSpecimen.from_map(column_map)
+    config = _build_run_config(table, options, rig_toml, samples.rate_hz, file_labels, specimen)
     if samples.doubts:
         remedies = dict.fromkeys(doubt.remedy for doubt in samples.doubts)
         raise InputError(
@@ -186,8 +204,7 @@ def import_table(
     # the steps of a placeholder's sweep were never played
     steps = labels.steps or (() if is_history or is_plain else config.steps)
     config = replace(config, drive=replace(config.drive, steps=steps))
-    mass_text = "unit mass" if mass_kg is None else f"{mass_kg:g} kg"
-    missing_profile = (NO_PROFILE.format(mass=mass_text),) if is_plain else ()
+    missing_profile = (NO_PROFILE.format(**specimen.describe()),) if is_plain else ()
     notes = (*missing_profile, *samples.notes, *labels.messages, _describe_steps(labels))
     run = make_run_id(file.stem)
     start = replace(
@@ -348,7 +365,7 @@ def _build_run_config(
     rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,
-    mass_kg: float | None,
+    specimen: _StatedSpecimen,
 ) -> RunConfig:
     """Build the run config of the log, with the sampling rate of the file."""
     file, profile = table.path, options.profile
@@ -359,11 +376,15 @@ def _build_run_config(
             profile_toml = _set_rate(profile_toml, rate_hz)
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
     if profile is None:
-        return _build_placeholder(table, rig_toml, rate_hz, labels, mass_kg)
-    if mass_kg is not None:
-        raise InputError(
-            "the profile states the mass", key="mass_kg", value=mass_kg, remedy="leave one out"
-        )
+        return _build_placeholder(table, rig_toml, rate_hz, labels, specimen)
+    for key, value in asdict(specimen).items():
+        if value is not None:
+            raise InputError(
+                f"the profile states the {key.split('_')[0]}",
+                key=key,
+                value=value,
+                remedy="leave one out",
+            )
     test_profile, text = load_profile(profile)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
@@ -377,9 +398,9 @@ def _build_placeholder(
     rig_toml: str,
     rate_hz: float,
     labels: DetectedSteps | None,
-    mass_kg: float | None,
+    specimen: _StatedSpecimen,
 ) -> RunConfig:
-    """Build the run config of a log whose specimen is unknown, but for its mass if it is given."""
+    """Build the run config of a log whose specimen is unknown, but for what is stated of it."""
     hz = min(MAX_PLACEHOLDER_HZ, rate_hz / SAMPLES_PER_CYCLE)
     if hz < MIN_PLACEHOLDER_HZ:
         raise InputError(
@@ -388,14 +409,15 @@ def _build_placeholder(
             allowed=f"{SAMPLES_PER_CYCLE * MIN_PLACEHOLDER_HZ:g} Hz or more",
             remedy="resample the table; or if its times are not in s, state their unit",
         )
-    mass = 1.0 if mass_kg is None else mass_kg
+    mass = 1.0 if specimen.mass_kg is None else specimen.mass_kg
     omega = 2.0 * math.pi * hz
     cycles, measured = typical_cycles(labels) if labels is not None else (3, 3)
     profile_toml = PLAIN_PROFILE.format(
         title=json.dumps(f"Imported: {table.path.name}"),
-        notes=json.dumps(UNIT_MASS_NOTE if mass_kg is None else "Without bumpers."),
+        notes=json.dumps(NO_PROFILE_NOTE.format(**specimen.describe())),
         rig=json.dumps(parse_toml(rig_toml, RigConfig, "rig file").name),
         mass_kg=mass,
+        gap_mm=math.inf if specimen.gap_mm is None else specimen.gap_mm,
         rate_hz=rate_hz,
         hz=hz,
         cycles=cycles,
