@@ -12,7 +12,13 @@ from tests.recovery.recordings import log_columns, oscillator
 from tests.studies.blind.law_study import find_law_of_base
 from twin.discovery import law_search
 from twin.discovery.discover import discover_effects, prepare_problem
-from twin.discovery.law_search import list_new_terms, propose_law, search_laws, select_law
+from twin.discovery.law_search import (
+    is_playable,
+    list_new_terms,
+    propose_law,
+    search_laws,
+    select_law,
+)
 from twin.discovery.law_terms import LAW_PREFIX, list_law_candidates, make_law_candidate
 from twin.discovery.motion import RecordScale
 from twin.discovery.parameters import EffectKey, ParameterSet
@@ -68,6 +74,26 @@ class TestTerms:
         offered = [term.name for term in list_new_terms(problem, fit)]
         assert "law_bumper_relaxation" not in offered
         assert {"law_relaxation", "law_bumper_power"} <= {*offered}
+
+    def test_a_law_that_the_solver_cannot_integrate_is_not_playable(self):
+        problem, start = prepare_bare_log().problem, prepare_bare_log().parameters
+        scale = problem.log_residuals[0].scale
+        (term,) = [
+            each
+            for each in list_law_candidates(scale, True)
+            if each.name.endswith("compression_damping")
+        ]
+        fitted = problem.fit_effects(start, ())
+        size, shape = term.amplitude.scale, term.shapes[0]
+        opposing, driving = (
+            replace(
+                fitted, effects=(term,),
+                fit=replace(fitted.fit, parameters=term.add_to(start, shape, amplitude)),
+            )
+            for amplitude in (size, -size)
+        )  # fmt: skip
+        assert is_playable(problem, opposing)
+        assert not is_playable(problem, driving)
 
     def test_laws_of_bumpers_need_contact(self):
         scale = prepare_bare_log().problem.log_residuals[0].scale

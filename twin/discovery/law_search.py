@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from table_io.errors import InputError
 from twin.discovery.candidates import Candidate
 from twin.discovery.discover import Discovery
 from twin.discovery.law_terms import find_law_class, list_law_candidates, round_exponent
@@ -20,6 +21,7 @@ from twin.discovery.selection import FittedSet, ProgressCallback, SelectionProbl
 from twin.discovery.symbolic_regression import list_symbolic_candidates
 from twin.discovery.verdict import closed_fraction
 from twin.evidence.selection import RoundEffort
+from twin.laws.checks import check_effect
 from twin.laws.effect import Effect, Place
 from twin.model.valid_range import list_inputs
 
@@ -70,7 +72,11 @@ def propose_law(
     nearest = min(singles, key=lambda fitted: fitted.cost, default=None)
     null, best = selection.null, discovery.verdict.best
     fitted_sets = search_laws(problem, null, best, report)
-    better = [each for each in fitted_sets if problem.is_worthwhile(best, each)]
+    better = [
+        each
+        for each in fitted_sets
+        if problem.is_worthwhile(best, each) and is_playable(problem, each)
+    ]
     return select_law(problem, null, better, nearest.names[0] if nearest else "")
 
 
@@ -98,6 +104,16 @@ def select_law(
         best, start, laws, after, problem.leaves_noise(best), nearest,
         find_law_class(terms[0]), _list_best_by_class(fitted_sets),
     )  # fmt: skip
+
+
+def is_playable(problem: SelectionProblem, fitted: FittedSet) -> bool:
+    """Return whether the solver can integrate the laws of a set with the values fitted."""
+    try:
+        for term in filter(find_law_class, fitted.effects):
+            check_effect(_describe_law(problem, fitted, term, ""))
+    except InputError:
+        return False
+    return True
 
 
 def _drop_laws(problem: SelectionProblem, null: FittedSet, fitted: FittedSet) -> FittedSet:
@@ -132,8 +148,7 @@ def search_laws(
 
 def list_new_terms(problem: SelectionProblem, null: FittedSet) -> list[Candidate]:
     """Return the terms of laws that logs may show and that a model does not have already."""
-    # without load cells contact is unknown, not absent
-    has_contact = any((log.contact_state != 0).any() for log in problem.log_residuals)
+    has_contact = any(log.shows_bumpers for log in problem.log_residuals)
     model = null.fit.parameters.to_model()
     known = {instance.effect.id for instance in model.effects}.union(model.coefficients)
     return [
