@@ -34,7 +34,9 @@ def build(columns: Float2D, residual: np.ndarray, noise: Float2D | None = None) 
     products = columns @ columns.T
     true = products if noise is None else products - noise
     scale = np.sqrt(np.diag(products))
-    return LinearEvidence(variants, {}, true, products, -columns @ residual, scale, FORCE, 1.0, 1.0)
+    return LinearEvidence(
+        variants, {}, true, products, -columns @ residual, scale, FORCE, 1.0, 1.0, residual
+    )
 
 
 def draw(count: int, seed: int) -> Float2D:

@@ -50,9 +50,18 @@ class FrequencyGrid:
         )
         return low
 
-    def to_spectrum(self, values: Float1D) -> Spectrum:
-        """Return the spectrum, (frequency,), of values at the original rate, (sample,)."""
-        return rfft(interpolate_missing(values), self.padded_size)[: self.bin_count]
+    def to_spectrum(self, values: Float1D, ends: tuple[Float1D, Float1D] | None = None) -> Spectrum:
+        """Return the spectrum, (frequency,), of values at the original rate, (sample,).
+
+        `ends` continue them before and after the record, up to half of `PAD_S` each; else by zeros.
+        """
+        whole = np.zeros(self.padded_size)
+        whole[: self.size] = interpolate_missing(values)
+        if ends is not None:
+            before, after = ends
+            whole[self.size : self.size + after.size] = after
+            whole[whole.size - before.size :] = before
+        return rfft(whole)[: self.bin_count]
 
     def apply_gain(self, values: Float1D, gain: Float1D) -> Float1D:
         """Filter values at the decimated rate, (sample,), with a gain, (frequency,)."""

@@ -109,7 +109,7 @@ def list_candidates(
     log_residuals: Sequence[LogResiduals], fitted: ParameterSet, without: Sequence[str] = ()
 ) -> tuple[tuple[Candidate, ...], dict[str, str]]:
     """Return (candidates not yet in the parameter set, reason for each excluded effect)."""
-    has_contact = any((residuals.contact_state != 0).any() for residuals in log_residuals)
+    has_contact = any(residuals.shows_bumpers for residuals in log_residuals)
     channels = set.intersection(*(set(residuals.signals.channels) for residuals in log_residuals))
     candidates, excluded = [], {}
     for effect in (*EFFECTS, *load_plugins()):

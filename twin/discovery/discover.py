@@ -45,6 +45,7 @@ from twin.discovery.selection import (
     select_effects,
 )
 from twin.discovery.signals import LogSignals, derives_acc
+from twin.discovery.starting_values import choose_start
 from twin.discovery.verdict import DiscoveryVerdict, qualify_none, widen_for_form
 from twin.evidence.selection import RoundEffort
 from twin.evidence.verdict import judge_selection
@@ -125,7 +126,10 @@ def prepare_problem(
     pairs = [(log.signals, log.contact_n) for log in logs]
     log_residuals = build_log_residuals(pairs, model)
     _check_enough_data(log_residuals)
-    parameters = initialize_parameters(log_residuals, model)
+    parameters = choose_start(log_residuals, initialize_parameters(log_residuals, model))
+    log_residuals = tuple(
+        replace(residuals, reference=parameters.to_model()) for residuals in log_residuals
+    )
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
     fitted = first.parameters
     log_residuals = tuple(
@@ -138,6 +142,18 @@ def prepare_problem(
             f"the recordings are long: of the cycles of each step only the last are used, one in "
             f"{thinned} and at least two"
         )
+    notes += [
+        f"{residuals.signals.name}: no rest and no repeated cycle shows the noise; it is taken "
+        "from what redundant sensors, and all candidates together, leave"
+        for residuals in log_residuals
+        if not residuals.knows_noise
+    ]
+    notes += [
+        f"{residuals.signals.name}: no contact lasts longer than its filters settle; the bumpers "
+        "are not judged"
+        for residuals in log_residuals
+        if residuals.contact_state.any() and not residuals.shows_bumpers
+    ]
     log_residuals, first = add_nuisances(log_residuals, first.parameters, mapper)
     library, excluded = list_candidates(log_residuals, parameters, without)
     return PreparedProblem(
@@ -190,7 +206,7 @@ def _start_nuisances(
 
 def initialize_parameters(log_residuals: Sequence[LogResiduals], model: Model) -> ParameterSet:
     """Return the start of a fit of the model."""
-    has_contact = [bool((residuals.contact_state != 0).any()) for residuals in log_residuals]
+    has_contact = [residuals.shows_bumpers for residuals in log_residuals]
     fit_input = any(
         derives_acc(residuals.signals.channels)
         and "damper_force_n" not in residuals.signals.channels
@@ -281,6 +297,8 @@ def discover_effects(
     prepared = prepare_problem(logs, model, without, mapper)
     once = (RoundEffort(),)
     selection = select_effects(prepared.problem, prepared.parameters, report, rounds=once)
+    if selection.evidence is not None:
+        prepared = replace(prepared, problem=prepared.problem.with_noise_of(selection.evidence))
     if selection.best.effects and selection.complete:
         # the errors of instruments were linear about a model without these effects
         prepared = _linearize_about(prepared, selection.best)
@@ -292,7 +310,9 @@ def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedPr
     """Return the problem with nuisances, and noise, about a model with effects."""
     problem, parameters = prepared.problem, fitted.fit.parameters
     log_residuals = tuple(
-        linearize_nuisances(replace(residuals, noise_scale={}), parameters, mapper=problem.mapper)
+        linearize_nuisances(
+            replace(residuals, noise_scale={}), parameters, calibrate=True, mapper=problem.mapper
+        )
         for residuals in problem.log_residuals
     )
     own = [free for free in parameters.free if not isinstance(free.key, NuisanceKey)]

@@ -448,7 +448,7 @@ def _start_rival(fitted: FittedSet, *log_residuals: LogResiduals) -> ParameterSe
     values: dict[ParameterKey, float] = dict.fromkeys(tares, 0.0)
     values |= dict.fromkeys((nuisance.key for nuisance in nuisances), 0.0)
     values[GapKey(new.log_number)] = parameters.values.get(last, 0.0)
-    contacts = [bool((log.contact_state != 0).any()) for log in log_residuals]
+    contacts = [log.shows_bumpers for log in log_residuals]
     base = () if any(contacts[:-1]) else (BUMPER_STIFFNESS, BUMPER_DAMPING)
     added = [
         free

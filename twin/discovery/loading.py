@@ -23,6 +23,7 @@ from twin.discovery.signals import (
     has_single_frequency,
     is_channel_alive,
 )
+from twin.discovery.starting_values import state_measured_gaps
 from twin.recording.reader import Recording
 from twin.recording.run_paths import resolve_log_path
 from twin.results.recordings import open_recording
@@ -91,8 +92,15 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
         )
     is_stated = "contact_n" in profile.comparison.model_fields_set
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
+    signals, sides = state_measured_gaps(signals, contact_n)
     log = PreparedLog(signals, contact_n, start.steps)
-    notes = _list_notes(recording, profile, signals, recorded, blocks, dead)
+    notes = [*_list_notes(recording, profile, signals, recorded, blocks, dead)]
+    if sides:
+        gaps = " and ".join(f"{1e3 * gap:.4g} mm" for gap in signals.gaps_m if math.isfinite(gap))
+        notes.append(
+            f"{name}: the gap is not stated; the load cells of the {' and '.join(sides)} show "
+            f"{gaps} from the middle"
+        )
     clipping = _list_clipping_notes(name, clipped, recorded, blocks)
     return LoadedLog(log, blocks, (*(f"{name}: {line}" for line in findings), *notes, *clipping))
 
@@ -163,7 +171,7 @@ def _list_notes(
             f"{name}: no load cell measures the {side} bumper, so all load cells are ignored; the "
             "balance of the mass gives the sum of both"
         )
-    yield from _check_loads(recording, name, profile, blocks, dead)
+    _check_loads(recording, profile, blocks, dead)
     for channel in blocks[0].channels if blocks else ():
         if channel not in CHANNEL_BY_NAME:
             continue  # declared in the rig file: not used
@@ -195,28 +203,21 @@ def _count_missing(blocks: Sequence[Block], channel: str) -> int:
 
 
 def _check_loads(
-    recording: Recording, name: str, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
-) -> Iterator[str]:
-    """Yield notes on loads the profile excludes; raise InputError for a load cell of wrong sign."""
+    recording: Recording, profile: Profile, blocks: Sequence[Block], dead: frozenset[str]
+) -> None:
+    """Raise InputError for a load cell of the wrong sign."""
     min_force_n = CLEAR_LOAD_FACTOR * profile.comparison.contact_n
-    sides = ("right", RIGHT_CELLS), ("left", LEFT_CELLS)
-    for (side, cells), gap in zip(sides, profile.specimen.gaps_m, strict=True):
-        for cell in cells:
-            if not blocks or cell not in blocks[0].channels or cell in dead:
-                continue
-            push, pull = _channel_extremes(blocks, cell)
-            if pull > max(min_force_n, CLEAR_LOAD_FACTOR * push):
-                raise InputError(
-                    f"reads {-pull:.0f} N under load; compression must be positive",
-                    where=recording.path,
-                    key=cell,
-                    remedy="import the channel with gain = -1",
-                )
-            if math.isinf(gap) and push > min_force_n:
-                yield (
-                    f"{name}: {cell} reads up to {push:.0f} N, but the profile has "
-                    f"no {side} bumper; set its gap in the profile"
-                )
+    for cell in LOAD_CELLS:
+        if not blocks or cell not in blocks[0].channels or cell in dead:
+            continue
+        push, pull = _channel_extremes(blocks, cell)
+        if pull > max(min_force_n, CLEAR_LOAD_FACTOR * push):
+            raise InputError(
+                f"reads {-pull:.0f} N under load; compression must be positive",
+                where=recording.path,
+                key=cell,
+                remedy="import the channel with gain = -1",
+            )
 
 
 def _channel_extremes(blocks: Sequence[Block], channel: str) -> tuple[float, float]:

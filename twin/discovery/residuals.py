@@ -41,6 +41,7 @@ from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
 
 MAX_GAP_ERROR_M = 1e-3  # of the readings of the set-up: with more, a gap is to be measured again
+MEDIAN_OF_NORMAL = 0.6745  # of the magnitude of a normal variable, over its standard deviation
 CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
 MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
 # A shorter contact is the ringing of a filter before or after a step of the force.
@@ -178,6 +179,13 @@ class LogResiduals:
             self.motion_cache[:] = [*unmodified, *recent, (sensors, motion)]
         return motion
 
+    @property
+    def knows_noise(self) -> bool:
+        """Whether readings at rest, or cycles that repeat, show the noise of the forces."""
+        m = self.motion()
+        repeats = (m.label == Label.MEASURE) & (m.step >= 0) & (m.cycle > 0)
+        return bool(self.signals.rest_noise) or bool(repeats.any())
+
     @cached_property
     def contact_state(self) -> npt.NDArray[np.int8]:
         """Measured contact of right and left, (2, sample): 1 contact, 0 none, -1 unknown."""
@@ -189,29 +197,24 @@ class LogResiduals:
             excess = max(float(np.nanmax(m.u)) - right, float(np.nanmax(-m.u)) - left)
             known = -1 if excess > -MAX_GAP_ERROR_M else 0
             return np.full((2, m.u.size), known, dtype=np.int8)
-        sides = []
-        shortest = max(
-            MIN_CONTACT_SAMPLES,
-            math.ceil(MIN_CONTACT_FILTER_CYCLES * m.rate_hz / self.signals.filter_hz) + 1,
-        )
-        for push, threshold, gap in zip(
-            (m.right, m.left), self.contact_thresholds_n, m.gaps_m, strict=True
-        ):
-            idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
-            sides.append(binary_opening(push - idle > threshold, np.ones(shortest)))
-        return np.array(sides, dtype=np.int8)
+        return read_contact(self.signals, m, self.contact_thresholds_n)
 
     @cached_property
     def contact_thresholds_n(self) -> tuple[float, float]:
         """Force of the right and of the left cells in N above which there is contact."""
-        m = self.motion()
-        squares = np.nan_to_num(m.acc[m.moving] ** 2)
-        inertia_n = m.mass_kg * math.sqrt(squares.mean()) if squares.size else 0.0
-        least = max(self.contact_n, MIN_CONTACT_SHARE * inertia_n)
-        right, left = (
-            max(least, CONTACT_NOISE_FACTOR * rms) for rms in (m.noise.right, m.noise.left)
-        )
-        return right, left
+        return find_contact_thresholds(self.signals, self.motion(), self.contact_n)
+
+    @cached_property
+    def shows_bumpers(self) -> bool:
+        """Whether forces of the bumpers can be in the residual: not if no contact is long enough.
+
+        Load cells show a contact between the margins in which filters settle.
+        """
+        rows = [
+            row for name, row in zip(self.rows, self.row_mask, strict=True) if name in CONTACT_ROWS
+        ]
+        has_cells = self.motion().has_load_cells
+        return any(row.any() for row in rows) if has_cells else bool(self.contact_state.any())
 
     @cached_property
     def row_mask(self) -> Bool2D:
@@ -947,6 +950,39 @@ class LogResiduals:
                 (mean - offset_sum - parameters.tare_error(self.log_number, quantity)) / sigma
             )
         return np.array(entries)
+
+
+def find_contact_thresholds(
+    signals: LogSignals, m: MeasuredMotion, least_n: float
+) -> tuple[float, float]:
+    """Return the force of the right and of the left cells in N above which there is contact.
+
+    Bumpers push: without a rest, what the cells read below zero shows their noise.
+    """
+    squares = np.nan_to_num(m.acc[m.moving] ** 2)
+    inertia_n = m.mass_kg * math.sqrt(squares.mean()) if squares.size else 0.0
+    least = max(least_n, MIN_CONTACT_SHARE * inertia_n)
+    thresholds = []
+    for push, rms in ((m.right, m.noise.right), (m.left, m.noise.left)):
+        below = push[m.moving & (push < 0.0)] if not signals.rest_noise else push[:0]
+        shown = -float(np.median(below)) / MEDIAN_OF_NORMAL if below.size else 0.0
+        thresholds.append(max(least, CONTACT_NOISE_FACTOR * max(rms, shown)))
+    return thresholds[0], thresholds[1]
+
+
+def read_contact(
+    signals: LogSignals, m: MeasuredMotion, thresholds_n: tuple[float, float]
+) -> npt.NDArray[np.int8]:
+    """Return the contact of right and left that the load cells show, (2, sample): 1 or 0."""
+    sides = []
+    shortest = max(
+        MIN_CONTACT_SAMPLES,
+        math.ceil(MIN_CONTACT_FILTER_CYCLES * m.rate_hz / signals.filter_hz) + 1,
+    )
+    for push, threshold, gap in zip((m.right, m.left), thresholds_n, m.gaps_m, strict=True):
+        idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
+        sides.append(binary_opening(push - idle > threshold, np.ones(shortest)))
+    return np.array(sides, dtype=np.int8)
 
 
 def measure_level(

@@ -9,7 +9,9 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from scipy.fft import irfft
+from scipy.integrate import cumulative_trapezoid
 from scipy.ndimage import uniform_filter1d
 from scipy.signal import spectrogram
 from scipy.stats import chi2
@@ -18,11 +20,7 @@ from table_io.block import Block, Bool2D, Float1D, Int1D, Label, find_stretches,
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.compare.hum import remove_hum
-from twin.compare.spectra import (
-    FrequencyGrid,
-    Spectrum,
-    exclude_margins,
-)
+from twin.compare.spectra import PAD_S, FrequencyGrid, Spectrum, exclude_margins
 from twin.discovery.motion import ConsistencyResidual, MeasuredMotion, MotionNoise
 from twin.discovery.noise import (
     RestNoise,
@@ -258,23 +256,32 @@ class LogSignals:
         return replace(self, spectra=spectra)
 
     def calibrate_noise(self) -> "LogSignals":
-        """Return the signals with the noise of laser and accelerometer as loud as they disagree.
+        """Return the signals with the noise of redundant sensors as loud as they disagree.
 
         No force law can make the two sensors of a body disagree: what exceeds the noise seen at
-        rest is noise in motion (light spot, resolution, drift).
+        rest is noise in motion (light spot, resolution, drift). Where no rest shows the noise,
+        it is all that does, of the load cells of a side, too; and sensors without another one are
+        as much louder than above the anti-alias filter, which is that of the logger.
         """
+        is_known = bool(self.rest_noise)
+        pairs = SENSOR_PAIRS if is_known else {**SENSOR_PAIRS, **CELL_PAIRS}
         noise = dict(self.noise)
         if not self.good.any():
             return self
         share = float(self.good.mean())
+        ratios: dict[str, Float1D] = {}
         for residual in self.fuse_motion().consistency_residuals:
-            channels = SENSOR_PAIRS.get(residual.body, ())
+            channels = pairs.get(residual.body, ())
             # an offset would leak over the cuts at lost samples
             offset = residual.values[self.good].mean() if share < 1.0 else 0.0
             values = np.where(self.good, residual.values - offset, 0.0) / math.sqrt(share)
             ratio = np.sqrt(compare_with_white(values, self.pass_of(residual.body)))
-            ratio = np.minimum(ratio, MAX_NOISE_RATIO)
-            noise |= {name: noise[name] * ratio for name in channels if name in noise}
+            ratio = np.minimum(ratio, MAX_NOISE_RATIO) if is_known else ratio
+            ratios |= dict.fromkeys(channels, ratio)
+        if ratios and not is_known:
+            usual = np.median(list(ratios.values()), axis=0)
+            ratios = dict.fromkeys(noise, usual) | ratios
+        noise |= {name: noise[name] * ratio for name, ratio in ratios.items() if name in noise}
         return replace(self, noise=noise)
 
     def fuse_motion(self, sensors: Sequence[SensorModel] = ()) -> MeasuredMotion:
@@ -529,21 +536,21 @@ def build_signals(
     grid = FrequencyGrid(len(block), block.rate_hz)
     lost_margin = round(LOST_MARGIN_S * block.rate_hz)
     usable = exclude_margins(good, lost_margin, lost_margin)
-    margin = round(OPEN_END_S * block.rate_hz)
-    # also where the drive rests: the mass may not yet
-    usable[:margin], usable[-margin:] = False, False
-    size = -(-len(block) // grid.decimation)
     frequency = grid.omega / (2 * np.pi * block.rate_hz)
     noise = {
         key: estimate_noise_density(values, at_rest, frequency) for key, values in columns.items()
     }
+    margin = round(OPEN_END_S * block.rate_hz)
+    # also where the drive rests: the mass may not yet
+    usable[:margin], usable[-margin:] = False, False
+    size = -(-len(block) // grid.decimation)
     measured = {
         key: measure_rest_noise(values, at_rest, block.rate_hz) for key, values in columns.items()
     }
     rest_noise = {key: value for key, value in measured.items() if value is not None}
-    spectra = {
-        key: grid.to_spectrum(values) for key, values in _fill_lost(columns, grid, noise).items()
-    }
+    filled = _fill_lost(columns, grid, noise)
+    ends = _continue_ends(filled, grid)
+    spectra = {key: grid.to_spectrum(values, ends.get(key)) for key, values in filled.items()}
     without_hum, hum_hz = remove_hum(spectra, grid, at_rest, _find_drive_hz(block))
     signals = LogSignals(
         name, mass_kg, gaps_m, grid, grid.omega, grid.low_pass,
@@ -568,6 +575,59 @@ def build_signals(
     removed = u - grid.apply_gain(u, gain)
     is_whole = _is_noise(signals, removed, density * (1.0 - gain))
     return replace(signals, motion_pass=gain) if is_whole else signals
+
+
+def _continue_ends(
+    columns: Mapping[str, Float1D], grid: FrequencyGrid
+) -> dict[str, tuple[Float1D, Float1D]]:
+    """Return what continues the sensors of a fused motion before and after the record, to rest.
+
+    A displacement that ends off zero is a step, of which its accelerometer shows nothing: it would
+    ring in the fused motion for as long as its slowest frequency that is taken from the latter.
+    Both are continued by the same smooth motion, from where they end.
+    """
+    has_lasers = {"mass_disp_m", "table_disp_m"} <= columns.keys()
+    groups = [(laser, {acc: 1.0}) for _, laser, acc in BODY_SENSORS]
+    ends: dict[str, tuple[Float1D, Float1D]] = {}
+    for laser, signs in groups if has_lasers else [("rel_disp_m", RELATIVE_SIGNS)]:
+        if not {laser, *signs} <= columns.keys():
+            continue
+        acc = np.sum([sign * columns[name] for name, sign in signs.items()], axis=0)
+        after, back = (
+            _continue_motion(columns[laser][::step], acc[::step], grid.rate_hz) for step in (1, -1)
+        )
+        first = next(iter(signs))
+        silence = np.zeros(after[0].size)
+        ends |= dict.fromkeys(signs, (silence, silence))
+        ends[laser] = back[0][::-1], after[0]
+        ends[first] = signs[first] * back[1][::-1], signs[first] * after[1]
+    return ends
+
+
+def _continue_motion(position: Float1D, acc: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
+    """Return displacement and acceleration of a motion that comes to rest after its record.
+
+    A polynomial of fifth order, from the last position and velocity; these are those with which the
+    integrated acceleration follows the displacement at the end of the record.
+    """
+    size = min(round(OPEN_END_S * rate_hz), position.size)
+    time = (np.arange(size) - size + 1.0) / rate_hz
+    velocity = cumulative_trapezoid(np.nan_to_num(acc[-size:]), dx=1.0 / rate_hz, initial=0.0)
+    moved = cumulative_trapezoid(velocity, dx=1.0 / rate_hz, initial=0.0)
+    rest = position[-size:] - moved
+    used = np.isfinite(rest)
+    if used.sum() < 2:
+        return np.zeros(0), np.zeros(0)
+    slope, start = np.polyfit(time[used], rest[used], 1)
+    x, v, a = start + moved[-1], slope + velocity[-1], np.nan_to_num(acc[-1])
+    length = 0.5 * PAD_S
+    s = np.arange(1, round(length * rate_hz)) / (length * rate_hz)
+    # x(0), x'(0), x''(0) as given, and all of them 0 at s = 1
+    of_x = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])
+    of_v = Polynomial([0.0, 1.0, 0.0, -6.0, 8.0, -3.0])
+    of_a = Polynomial([0.0, 0.0, 0.5, -1.5, 1.5, -0.5])
+    motion = x * of_x + v * length * of_v + a * length**2 * of_a
+    return motion(s), motion.deriv(2)(s) / length**2
 
 
 def _fill_lost(

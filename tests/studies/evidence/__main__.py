@@ -7,9 +7,10 @@ import argparse
 import json
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +20,12 @@ from tests.studies.evidence.laboratory import (
     Instruments,
     Specimen,
     StepTest,
+    Test,
     record,
     record_component,
     vary,
 )
+from tests.studies.evidence.worlds import draw_world
 
 
 @dataclass(frozen=True)
@@ -34,7 +37,7 @@ class Case:
     seed: int
     specimen: Specimen = Specimen()  # noqa: RUF009
     lab: Instruments = Instruments()  # noqa: RUF009
-    test: StepTest = StepTest()  # noqa: RUF009
+    test: Test = StepTest()  # noqa: RUF009
     component: tuple[tuple[float, ...], tuple[float, ...], float] | None = None
     truth: tuple[str, ...] = ()
     place: str = ""  # of a stranger: "damper" or "bumper"
@@ -214,13 +217,22 @@ def draw_stranger_cases(seeds: range) -> Iterator[Case]:
                    truth=(KNOWN[name],) if name in KNOWN else (), place=place)  # fmt: skip
 
 
+def draw_world_cases(seeds: range, hide: str = "") -> Iterator[Case]:
+    """Laboratories of any size, with what is hidden."""
+    for seed in seeds:
+        specimen, lab, motion, name, _ = draw_world(seed, hide)
+        truth = (name,) if hide == "effect" else ()
+        label = f"{name} {motion.kind} {specimen.mass:.0f} kg {motion.natural_hz:.2g} Hz"
+        yield Case(f"world {hide}".strip(), label, seed, specimen, lab, motion, truth=truth)
+
+
 def _test(gap: str) -> StepTest:
     if gap in ("g0", "gm1"):
         return StepTest(2.0, 9.0, 1.0, cycles=10)
     return StepTest()
 
 
-GROUPS = {
+GROUPS: dict[str, Callable[[range], Iterator[Case]]] = {
     "component": draw_component_cases,
     "clean": draw_clean_cases,
     "other": draw_other_cases,
@@ -228,6 +240,9 @@ GROUPS = {
     "small": draw_small_cases,
     "pair": draw_pair_cases,
     "stranger": draw_stranger_cases,
+    "world": draw_world_cases,
+    "world effect": partial(draw_world_cases, hide="effect"),
+    "world stranger": partial(draw_world_cases, hide="stranger"),
 }
 
 
@@ -243,14 +258,15 @@ def play(case: Case) -> dict[str, object]:
             columns = record_component(s, case.lab, case.seed, *case.component)
         else:
             columns = record(s, case.lab, case.seed, case.test)
-            profile = format_profile(s, case.test)
+            profile = format_profile(s, case.test) if isinstance(case.test, StepTest) else ""
         start = time.process_time()
         row: dict[str, object] = {
             "group": case.group, "name": case.name, "seed": case.seed, "truth": case.truth,
             "place": case.place,
         }  # fmt: skip
         try:
-            log = import_columns(columns, folder, profile)
+            stated = None if profile or case.component else s.mass
+            log = import_columns(columns, folder, profile, stated)
             start = time.process_time()
             result = discover([log])
         except Exception as error:
@@ -296,9 +312,9 @@ def judge(row: dict[str, object]) -> str:
     """Return right, wrong or half for what is said of a case."""
     verdict, effects = str(row["verdict"]), [str(e) for e in row.get("effects", [])]  # type: ignore[attr-defined]
     blamed = any(e.startswith(("sensor_", "mass_error")) for e in effects)
-    if row["group"] in ("component", "clean", "other"):
+    if row["group"] in ("component", "clean", "other", "world"):
         return "right" if verdict == "none" and not row.get("blamed") else "wrong"
-    if row["group"] in ("effect", "pair"):
+    if row["group"] in ("effect", "pair", "world effect"):
         if verdict == "named" and sorted(effects) == sorted(row["truth"]):  # type: ignore[call-overload]
             return "right"
         return "open" if verdict in ("unexplained", "ambiguous") and not blamed else "wrong"

@@ -8,6 +8,7 @@ real ones do: shared load cells, gains, lags, filters, hum, drift, missing chann
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Protocol
 
 import numba
 import numpy as np
@@ -165,29 +166,28 @@ class StepTest:
     acc: float = 0.05 * GRAVITY_M_S2
     rate_hz: float = 1000.0
 
-
-def _drive(test: StepTest, rest_s: float) -> tuple[Float1D, Float1D]:
-    """Return (displacement, acceleration) of the table at half the fine step."""
-    count = round((test.stop_hz - test.start_hz) / test.step_hz) + 1
-    grid = np.linspace(test.start_hz, test.stop_hz, count)
-    grid = np.concatenate([grid, grid[::-1]])
-    dt = 0.5 / FINE_HZ
-    amplitude, phase = [], []
-    for hz in grid:
-        n = round(test.cycles / hz / dt)
-        phase.append(np.full(n, 2 * np.pi * hz * dt))
-        amplitude.append(np.full(n, test.acc / (2 * np.pi * hz) ** 2))
-    a, rate = np.concatenate(amplitude), np.concatenate(phase)
-    smooth = round(0.4 / dt)
-    kernel = np.hanning(smooth) / np.hanning(smooth).sum()
-    a = np.convolve(np.concatenate([np.zeros(smooth), a, np.zeros(smooth)]), kernel, "same")
-    # no table changes its velocity at once
-    rate = np.concatenate([np.full(2 * smooth, rate[0]), rate, np.full(2 * smooth, rate[-1])])
-    rate = np.convolve(rate, kernel, "same")[smooth:-smooth]
-    disp = a * np.sin(np.cumsum(rate))
-    disp = np.concatenate([np.zeros(round(rest_s / dt)), disp, np.zeros(round(0.5 / dt))])
-    acc = np.gradient(np.gradient(disp, dt), dt)
-    return disp, acc
+    def drive(self, rest_s: float) -> tuple[Float1D, Float1D]:
+        """Return (displacement, acceleration) of the table at half the fine step."""
+        count = round((self.stop_hz - self.start_hz) / self.step_hz) + 1
+        grid = np.linspace(self.start_hz, self.stop_hz, count)
+        grid = np.concatenate([grid, grid[::-1]])
+        dt = 0.5 / FINE_HZ
+        amplitude, phase = [], []
+        for hz in grid:
+            n = round(self.cycles / hz / dt)
+            phase.append(np.full(n, 2 * np.pi * hz * dt))
+            amplitude.append(np.full(n, self.acc / (2 * np.pi * hz) ** 2))
+        a, rate = np.concatenate(amplitude), np.concatenate(phase)
+        smooth = round(0.4 / dt)
+        kernel = np.hanning(smooth) / np.hanning(smooth).sum()
+        a = np.convolve(np.concatenate([np.zeros(smooth), a, np.zeros(smooth)]), kernel, "same")
+        # no table changes its velocity at once
+        rate = np.concatenate([np.full(2 * smooth, rate[0]), rate, np.full(2 * smooth, rate[-1])])
+        rate = np.convolve(rate, kernel, "same")[smooth:-smooth]
+        disp = a * np.sin(np.cumsum(rate))
+        disp = np.concatenate([np.zeros(round(rest_s / dt)), disp, np.zeros(round(0.5 / dt))])
+        acc = np.gradient(np.gradient(disp, dt), dt)
+        return disp, acc
 
 
 def _read(
@@ -220,12 +220,22 @@ def _read(
     return read + lab.offset * float(values.std()) * rng.standard_normal()
 
 
+class Test(Protocol):
+    """What a table plays, and the rate of the logger."""
+
+    @property
+    def rate_hz(self) -> float: ...
+
+    def drive(self, rest_s: float) -> tuple[Float1D, Float1D]:
+        """Return (displacement, acceleration) of the table at half the fine step."""
+
+
 def record(
-    specimen: Specimen, lab: Instruments, seed: int, test: StepTest = StepTest()
+    specimen: Specimen, lab: Instruments, seed: int, test: Test = StepTest()
 ) -> dict[str, Float1D]:
     """Return the channels of a recording by canonical name, (sample,) each."""
     rng = np.random.default_rng(seed)
-    disp, acc = _drive(test, lab.rest_s)
+    disp, acc = test.drive(lab.rest_s)
     out = np.zeros((6, acc.size // 2))
     _integrate(specimen.vector(), specimen.mass, acc, disp, 1.0 / FINE_HZ, out)
     disp, acc = disp[::2][: out.shape[1]], acc[::2][: out.shape[1]]
