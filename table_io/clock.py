@@ -48,10 +48,6 @@ class ManualClock:
     def wait_until(self, when: float) -> None:
         self.time_s = max(self.time_s, when)
 
-    def set_back(self, when: float) -> None:
-        """Go back to an earlier time in s."""
-        self.time_s = when
-
 
 def cpu_seconds() -> float:
     """Return the processor time used by all threads of this process in s."""

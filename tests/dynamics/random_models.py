@@ -18,7 +18,20 @@ from twin.model.parameters import Parameters
 MAX_PERIODS = 8
 MAX_SETTLING = 1200  # periods
 RELATIVE_DISTURBANCE = 1e-8  # of the size, from which a motion leaves or comes back
+PENETRATION_TOL_M = 1e-7  # m: of sampled motion, whose drive is linear between samples
+RETURN_TOL = 1e-3  # of the travel: error of the same sampled motion after an orbit
+SAMPLES_PER_PERIOD = 2000
 SETTLED_DISTANCE = 1e-9  # of the size: a motion that returns so close has settled
+
+
+def is_admissible(orbit: Orbit) -> bool:
+    """Check densely sampled motion: it returns, no mass inside a bumper, no bumper pulls."""
+    parameters = orbit.period_map.model.parameters
+    u, _, _, f_r, f_l, u_r, u_l = orbit.sample_motion(SAMPLES_PER_PERIOD * orbit.periods)
+    clearance = min((parameters.gap_r + u_r - u).min(), (u - u_l + parameters.gap_l).min())
+    tolerance = PENETRATION_TOL_M + RETURN_TOL * float(np.ptp(u))
+    returns = abs(u[-1] - orbit.x[0]) < tolerance * max(1.0, abs(orbit.multipliers[0]))
+    return bool(returns and clearance > -PENETRATION_TOL_M and f_r.min() >= 0 and f_l.max() <= 0)
 
 
 @dataclass(frozen=True)
@@ -161,7 +174,7 @@ def check_orbits(diagram: Diagram, count: int, independent: int, seed: int, find
         return
     for orbit in random.choice(np.array(orbits, dtype=object), count):
         findings.checked += 1
-        if not orbit.is_admissible():
+        if not is_admissible(orbit):
             findings.false.append(f"inadmissible at {orbit.frequency_hz:.6f}")
         problem = contradicts_simulation(orbit)
         findings.simulated += 1

@@ -36,7 +36,6 @@ from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from table_io.records import SampleGap
 
-REASONS = ("wild", "clipped", "stuck")
 JUDGED = tuple(name for name in CHANNEL_BY_NAME if name != "drive_disp_m")
 MIN_SAMPLES = 50  # of a channel that is judged
 # Deviation of a wild sample over the largest other one: impacts of one test differ by less.

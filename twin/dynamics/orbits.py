@@ -24,9 +24,6 @@ MAX_NEWTON_STEPS = 40
 RESIDUAL_TOL = 1e-10  # of the orbit's size; a last Newton step then leaves rounding errors only
 DIFFERENCE_STEP = 1e-6  # relative step of central differences by other parameters
 MIN_FREQUENCY_RATIO = 0.02  # of an iterate to the start: a long period costs much time
-PENETRATION_TOL_M = 1e-7  # m: of sampled motion, whose drive is linear between samples
-RETURN_TOL = 1e-3  # of the travel: error of the same sampled motion after an orbit
-SAMPLES_PER_PERIOD = 2000
 SAME_ORBIT = 1e-5  # of the size: distance of two orbits that are the same
 MAX_ORBIT_DISTANCE = 0.1  # of the size: from a motion to the orbit that attracts it
 
@@ -88,17 +85,6 @@ class Orbit:
     def sample_motion(self, count: int) -> Float2D:
         """Return (7, count) samples of the orbit, `closed_form.OUTPUT_NAMES`."""
         return self.period_map.sample_motion(self.x, self.periods, count)
-
-    def is_admissible(self) -> bool:
-        """Check densely sampled motion: it returns, no mass inside a bumper, no bumper pulls."""
-        parameters = self.period_map.model.parameters
-        u, _, _, f_r, f_l, u_r, u_l = self.sample_motion(SAMPLES_PER_PERIOD * self.periods)
-        clearance = min((parameters.gap_r + u_r - u).min(), (u - u_l + parameters.gap_l).min())
-        tolerance = PENETRATION_TOL_M + RETURN_TOL * float(np.ptp(u))
-        returns = abs(u[-1] - self.x[0]) < tolerance * max(1.0, abs(self.multipliers[0]))
-        return bool(
-            returns and clearance > -PENETRATION_TOL_M and f_r.min() >= 0 and f_l.max() <= 0
-        )
 
     def is_same(self, other: "Orbit") -> bool:
         """Return whether an orbit at the same parameters is this one, up to whole periods."""
