@@ -161,9 +161,10 @@ def test_prc_fits_a_narrow_terminal_and_a_file_is_not_cut(run_folder: Path) -> N
         ("twin.cli.table", "numpy numba scipy pydantic matplotlib mcap zenoh rerun"),
         ("twin.guide.reference_command", "numba scipy matplotlib zenoh"),
         ("twin.live.control", "typer numpy numba pydantic rich google.protobuf ssl"),
+        ("twin.inspection.folder_report", "matplotlib scipy.signal"),
     ],
 )
-def test_help_and_a_stop_order_are_quick(module: str, slow: str) -> None:
+def test_help_report_and_a_stop_order_import_nothing_slow(module: str, slow: str) -> None:
     """What is slow to import is imported by the command that needs it."""
     code = (
         f"import sys, twin.cli.entry, {module}; "
@@ -173,17 +174,6 @@ def test_help_and_a_stop_order_are_quick(module: str, slow: str) -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.strip() == "[]"
-
-
-def test_report_imports_no_matplotlib_and_scipy_signal_is_for_discovery() -> None:
-    code = (
-        "import sys; slow = {'matplotlib', 'scipy.signal'}; "
-        "import twin.inspection.folder_report; print(sorted(slow & set(sys.modules)))"
-    )
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
-    assert result.stdout == "[]\n"
 
 
 @pytest.mark.parametrize(("command", "kept"), [("run", True), ("campaign", True), ("prc", False)])

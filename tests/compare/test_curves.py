@@ -90,19 +90,21 @@ def test_right_hysteresis(source: str) -> None:
     assert detect_hysteresis(points, "twin" if source == "measured" else "measured") == ([], [])
 
 
-def test_left_hysteresis() -> None:
-    points = sweep(softening(3.55), softening(2.65))
+@pytest.mark.parametrize(
+    ("branch", "forward", "backward", "kinds"),
+    [
+        (softening, (3.5, 3.6), (2.7, 2.6), ("left", "up", "down")),
+        (hardening, (3.9, 4.0), (2.1, 2.0), ("right", "down", "up")),  # to the ends of the grid
+    ],
+)
+def test_hysteresis_lies_between_its_jumps(branch, forward, backward, kinds) -> None:
+    points = sweep(branch(sum(forward) / 2), branch(sum(backward) / 2))
     assert detect_hysteresis(points, "measured") == (
-        [PrcJump("forward", 3.5, 3.6, "up"), PrcJump("backward", 2.7, 2.6, "down")],
-        [Hysteresis("left", 2.7, 3.5)],
-    )
-
-
-def test_a_jump_may_lead_to_either_end_of_the_grid() -> None:
-    points = sweep(hardening(3.95), hardening(2.05))
-    assert detect_hysteresis(points, "measured") == (
-        [PrcJump("forward", 3.9, 4.0, "down"), PrcJump("backward", 2.1, 2.0, "up")],
-        [Hysteresis("right", 2.1, 3.9)],
+        [
+            PrcJump("forward", forward[0], forward[1], kinds[1]),
+            PrcJump("backward", backward[0], backward[1], kinds[2]),
+        ],
+        [Hysteresis(kinds[0], backward[0], forward[0])],
     )
 
 

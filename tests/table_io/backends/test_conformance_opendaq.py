@@ -93,18 +93,14 @@ def replace_signals(rig: RigConfig, **signals: str) -> RigConfig:
     return rig.model_copy(update={"opendaq": wiring})
 
 
-def test_signal_that_is_not_there_is_named_with_those_that_are(bench: Bench) -> None:
-    source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="cell_9"), RATE_HZ, bench.clock)
-    with raises_input_error(
-        key="opendaq.signals.force_r1_n", value="cell_9", allowed="/Sig/cell_r1"
-    ):
-        source.open()
-    source.close()
-
-
-def test_signal_without_time_stamps_is_refused(bench: Bench) -> None:
-    source = OpenDaqSource(replace_signals(bench.rig, force_r1_n="time"), RATE_HZ, bench.clock)
-    with raises_input_error(key="opendaq.signals.force_r1_n", value="time"):
+@pytest.mark.parametrize(
+    ("signal", "fields"), [("cell_9", {"allowed": "/Sig/cell_r1"}), ("time", {})]
+)
+def test_signal_that_is_not_there_or_has_no_time_stamps_is_refused(
+    bench: Bench, signal: str, fields: dict[str, str]
+) -> None:
+    source = OpenDaqSource(replace_signals(bench.rig, force_r1_n=signal), RATE_HZ, bench.clock)
+    with raises_input_error(key="opendaq.signals.force_r1_n", value=signal, **fields):
         source.open()
     source.close()
 
