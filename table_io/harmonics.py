@@ -92,22 +92,33 @@ def _solve_harmonics(basis: Float2D, normal: Float2D, values: Float1D) -> tuple[
 
 
 def estimate_harmonic_error(values: Float1D, phase: Float1D, harmonics: int) -> float:
-    """Return the standard error of all harmonics of `track_harmonics`, their root sum of squares.
+    """Return the standard error of the harmonics of `track_harmonics`, their root sum of squares.
 
-    From the changes of offset, sines and cosines between successive cycles of `values`, (sample,),
-    at the `phase` in cycles: noise of any spectrum counts as it passed a control loop, and a trend
-    hardly. NaN if samples are lost or of less than two cycles.
+    From the changes of sines and cosines between successive cycles of `values`, (sample,), at the
+    `phase` in cycles: noise of any spectrum counts as it passed a control loop, and a trend hardly.
+    The offset does not count. NaN if samples are lost or of less than two cycles.
     """
-    basis = _harmonic_basis(phase, harmonics)
-    cycles = math.floor(np.ptp(phase) + 0.5) if phase.size else 0
-    if cycles < 2 or not np.isfinite(values).all():
+    if not np.isfinite(values).all():
         return math.nan
+    basis = _harmonic_basis(phase, harmonics)
     _, residual = _solve_harmonics(basis, _normal_matrix(basis), values)
+    return math.sqrt(_harmonic_variances(residual, basis, phase).sum())
+
+
+def _harmonic_variances(residual: Float1D, basis: Float2D, phase: Float1D) -> Float1D:
+    """Return the variances of sines and cosines by the changes between cycles, (2 orders,).
+
+    NaN with less than two cycles.
+    """
+    cycles = math.floor(np.ptp(phase) + 0.5) if phase.size else 0
+    if cycles < 2:
+        return np.full(basis.shape[1] - 1, np.nan)
     starts = np.searchsorted(phase, phase[0] + np.arange(cycles))
-    means = np.add.reduceat(residual[:, None] * basis, starts)
+    # The mean square of a sine is a half.
+    means = np.add.reduceat(2.0 * residual[:, None] * basis[:, 1:], starts)
     means /= np.diff(np.append(starts, phase.size))[:, None]
-    means[:, 1:] *= 2.0  # the mean square of a sine is a half
-    return float(np.sqrt(0.5 * (np.diff(means, axis=0) ** 2).mean(axis=0).sum() / cycles))
+    variances: Float1D = 0.5 * (np.diff(means, axis=0) ** 2).mean(axis=0) / cycles
+    return variances
 
 
 SWING_HARMONICS = 30  # of u: an impact on a bumper takes a tenth of a cycle or more
@@ -137,27 +148,44 @@ def find_steady_extremes(
     None if samples are lost, where cycles that differ or higher harmonics leave more than the
     noise and `max_left` of the swing, or more about an extreme than elsewhere: a short impact.
     """
-    fit = track_harmonics(u, phase, SWING_HARMONICS)
+    basis = _harmonic_basis(phase, SWING_HARMONICS)
+    fit = _fit_harmonics(basis, _normal_matrix(basis), u, SWING_HARMONICS)
     if not math.isfinite(fit.residual_rms):
         return None
-    error = fit.residual_rms * math.sqrt(2.0 / u.size)
+    waves = np.exp(2j * np.pi * phase)
+    residual = u - fit.offset - np.polyval([*fit.amplitudes[::-1], 0.0], waves).imag
+    # By the upper half of the harmonics: in the lower ones the cycles themselves may differ.
+    variances = _harmonic_variances(residual, basis, phase)
+    error = math.sqrt(variances[variances.size // 2 :].mean())
     kept = np.where(np.abs(fit.amplitudes) > MIN_HARMONIC_SIGMA * error, fit.amplitudes, 0.0)
     turns = np.exp(2j * np.pi * np.arange(SWING_PHASES) / SWING_PHASES)
     motion = np.polyval([*kept[::-1], 0.0], turns).imag
     high, low = fit.offset + float(motion.max()), fit.offset + float(motion.min())
-    # White noise of unit rms has a third difference of rms sqrt(20); the motion itself has none.
-    square = float(np.mean(np.diff(u, 3) ** 2)) / 20.0 * (1.0 + NOISE_ERROR / math.sqrt(u.size))
+    model = fit.offset + np.polyval([*kept[::-1], 0.0], waves).imag
+    # Noise is what differs within the shortest wave of a harmonic: that of a sensor with a filter
+    # too, which is the same in successive samples. Cycles that differ do so more slowly.
+    lag = max(round(u.size / (2 * SWING_HARMONICS * float(np.ptp(phase)))), 1)
+    scatter = _third_difference(u - model, lag)
+    # White noise of unit rms has a third difference of rms sqrt(20).
+    square = float(np.mean(scatter**2)) / 20.0 * (1.0 + NOISE_ERROR * math.sqrt(lag / u.size))
     allowed = math.hypot(math.sqrt(square), 0.5 * max_left * (high - low))
     if fit.residual_rms > allowed:
         return None
-    model = fit.offset + np.polyval([*kept[::-1], 0.0], np.exp(2j * np.pi * phase)).imag
     extremes = np.array([[motion.argmax()], [motion.argmin()]]) / SWING_PHASES
     near = np.abs((phase - extremes + 0.5) % 1.0 - 0.5) <= 0.5 / SWING_HARMONICS
     squares = (u - model) ** 2
     elsewhere = float(squares[~near.any(axis=0)].mean())
     sizes = near.sum(axis=1)
-    most = elsewhere * sizes * (1.0 + NOISE_ERROR / np.sqrt(np.maximum(sizes, 1)))
+    most = elsewhere * sizes * (1.0 + NOISE_ERROR * np.sqrt(lag / np.maximum(sizes, 1)))
     return (high, low) if (near @ squares <= most).all() else None
+
+
+def _third_difference(values: Float1D, lag: int) -> Float1D:
+    """Return the third difference of samples that are `lag` samples apart, (sample - 3 lag,)."""
+    difference: Float1D = values
+    for _ in range(3):
+        difference = difference[lag:] - difference[:-lag]
+    return difference
 
 
 def _mean_range(u: Float1D, phase: Float1D) -> float:

@@ -377,10 +377,10 @@ class OrbitPoint:
     and `u_m` are without what the feedback left moves u by. `u_m` are the harmonics U_0,
     U_1, ... as Re U_0, Im U_0, Re U_1, ... with u(t) = Re sum U_k exp(i k phi), where the table's
     acceleration is a sin(phi). `feedback_m` are the amplitudes of harmonics 0, 1, ... of the
-    correction, `noise_m` the standard error of their root sum of squares by the scatter between
-    cycles, and `command_m` is the amplitude of the command. `periods` counts from the change of
-    point. `multiplier` is the largest Floquet multiplier without feedback, `multiplier_sd` its
-    standard deviation.
+    correction, `feedback_size_m` the root sum of squares of all but the mean, which moves table and
+    mass alike, `noise_m` its standard error by the scatter between cycles, and `command_m` is the
+    amplitude of the command. `periods` counts from the change of point. `multiplier` is the largest
+    Floquet multiplier without feedback, `multiplier_sd` its standard deviation.
     """
 
     index: int
@@ -399,6 +399,11 @@ class OrbitPoint:
     accepted: bool
     reason: str
     multiplier_sd: float | None = None  # None if the multiplier was not measured
+
+    @property
+    def feedback_size_m(self) -> float:
+        """Root sum of squares of the harmonics of the feedback in m."""
+        return math.hypot(*self.feedback_m[1:])
 
 
 @dataclass(frozen=True, slots=True)
@@ -537,7 +542,7 @@ def _format_sweep_level(level: SweepLevel) -> str:
 
 
 def _format_orbit(orbit: OrbitPoint) -> str:
-    feedback = math.hypot(*orbit.feedback_m)
+    feedback = orbit.feedback_size_m
     share = 100 * feedback / orbit.command_m
     text = (
         f"orbit {orbit.step}: +-{1e3 * orbit.amplitude_m:.4g} mm at {orbit.frequency_hz:.5g} Hz; "

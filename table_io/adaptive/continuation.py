@@ -29,7 +29,10 @@ MAX_FREQUENCY_CHANGE = 0.02  # of the frequency, in one update
 FREQUENCY_WEIGHT = 3.0  # of a relative change of frequency against one of the amplitude
 MAX_SENSITIVITY = 20.0  # of u to the table's motion, off a fold
 MAX_REFERENCE_CHANGE = 0.15  # of the amplitude of u, in one update
-MIN_BROYDEN_CHANGE_M = 5e-6  # smaller ones tell less of the derivative than of the noise
+# Change of the reference that tells as much of the derivative as of the noise: in m where there is
+# none, and over the standard error of the feedback.
+BROYDEN_CHANGE_M = 5e-6
+BROYDEN_NOISE = 5.0
 MAX_AMPLITUDE_ERROR = 0.05  # of an accepted orbit, measured against the sought amplitude
 
 
@@ -38,13 +41,14 @@ class OrbitMeasurement:
     """Harmonics over whole cycles in m, at the phase of the table's acceleration.
 
     `u`, `x` and `feedback` (of the command) are real vectors, `response` is the table's motion over
-    its command at harmonics 0, 1, ..., complex.
+    its command at harmonics 0, 1, ..., complex. `noise_m` is the standard error of `feedback_m`.
     """
 
     u: Float1D
     x: Float1D
     feedback: Float1D
     response: Float1D
+    noise_m: float = 0.0
 
     @property
     def feedback_m(self) -> float:
@@ -63,7 +67,8 @@ class OrbitTarget:
 
     `slopes` is the derivative of the residual with respect to the reference and to the frequency
     over `scale_hz_m`, both in m, (2 H + 1, 2 H + 2). Corrections stay in the plane through
-    `origin`, where the target began, across the `direction` of the branch, (3,) each.
+    `origin`, where the target began, across the `direction` of the branch, (3,) each. `last_change`
+    is that of reference and frequency, `last_shift` what the table's change was to add to x, in m.
     """
 
     position: int
@@ -75,6 +80,7 @@ class OrbitTarget:
     origin: Float1D = field(default_factory=lambda: np.zeros(3))
     update: int = 0
     last_change: Float1D | None = None
+    last_shift: Float1D | None = None
     last_residual: Float1D | None = None
 
 
@@ -216,16 +222,10 @@ def correct_target(
     `table_change` are the harmonics of x in m by which the command will change the table.
     """
     orbit = plan.points[target.position]
-    residual = _free_motion(orbit, measured, table_change) - target.reference
-    slopes = target.slopes
-    if (
-        target.last_change is not None
-        and target.last_residual is not None
-        and np.linalg.norm(target.last_change) > MIN_BROYDEN_CHANGE_M
-    ):
-        change = target.last_change
-        error = residual - target.last_residual - slopes @ change
-        slopes = slopes + np.outer(error, change) / (change @ change)
+    shift = _move_mass(orbit, np.zeros(target.reference.size) + table_change)
+    residual = measured.x - _move_mass(orbit, _move_table(measured)) - target.reference
+    slopes = _correct_slopes(target, residual, measured.noise_m)
+    residual = residual + shift
     condition, goal = (
         _phase_condition(orbit, target)
         if plan.condition == "phase"
@@ -245,8 +245,26 @@ def correct_target(
         slopes=slopes,
         update=target.update + 1,
         last_change=change,
+        last_shift=shift,
         last_residual=residual,
     )
+
+
+def _correct_slopes(target: OrbitTarget, residual: Float1D, noise_m: float) -> Float2D:
+    """Return the derivative of the residual by Broyden's rule, (2 H + 1, 2 H + 2).
+
+    `residual` is that of the motion as it was measured. Reference, frequency and table changed
+    together; what the last change did not foresee is shared among them and the noise.
+    """
+    change, shift = target.last_change, target.last_shift
+    if change is None or shift is None or target.last_residual is None:
+        return target.slopes
+    error = residual - target.last_residual - target.slopes @ change
+    spread_m = max(BROYDEN_CHANGE_M, BROYDEN_NOISE * noise_m)
+    slopes: Float2D = target.slopes + np.outer(error, change) / (
+        change @ change + shift @ shift + spread_m**2
+    )
+    return slopes
 
 
 def _arclength_condition(orbit: PlannedOrbit, target: OrbitTarget) -> tuple[Float1D, float]:
@@ -290,12 +308,9 @@ def _move_table(measured: OrbitMeasurement) -> Float1D:
     return pack_harmonics(unpack_harmonics(measured.feedback) * measured.response)
 
 
-def _free_motion(
-    orbit: PlannedOrbit, measured: OrbitMeasurement, table_change: Float1D | float
-) -> Float1D:
-    """Return the harmonics of x in m without the feedback, after a change of the table."""
-    table = _move_table(measured) - table_change
-    return measured.x - _bounded_jacobian(orbit) @ table - table
+def _move_mass(orbit: PlannedOrbit, table: Float1D) -> Float1D:
+    """Return the harmonics in m by which harmonics of the table change those of x."""
+    return _bounded_jacobian(orbit) @ table + table
 
 
 def is_on_branch(plan: OrbitPlan, target: OrbitTarget, measured: OrbitMeasurement) -> bool:

@@ -28,14 +28,14 @@ from table_io.config.excitation.continuation import unpack_harmonics
 from table_io.config.excitation.waveform import smoothstep
 from table_io.excitation.drive import Correction, Drive
 
-WINDOW_S = 0.03  # of the fit: longer rejects more noise, shorter follows a faster growth
+# Of the fit. Longer rejects more noise, which a limited acceleration would rectify into a steady
+# feedback; shorter follows a faster growth.
+WINDOW_S = 0.06
 BLEND_S = 0.02  # from the previous function to the next
 BLEND_FACTORS = (1.0, 1.5, 2.25, 3.5, 5.0)  # on it: the first that the acceleration allows
 PREDICTION_S = 0.05  # after the horizon, until the function fades if no block replaces it
 FADE_S = 0.15
-# Acceleration of command and feedback over that of the held command. With less, the orbits of a
-# coarse plan are lost, which the feedback must reach from further off: 3 of 9 at 1.3, all at 1.4.
-MAX_COMMAND_RATIO = 1.4
+MAX_COMMAND_RATIO = 1.125  # acceleration of command and feedback over that of the held command
 STEADY_SHARE = 0.98  # of that acceleration for a steady correction: the rest is for its changes
 
 

@@ -327,7 +327,10 @@ def decide_orbit(state: SequencerState) -> SequencerState:
     played = rotate_harmonics(target.reference, 2 * math.pi * target.frequency_hz * late_s)
     target = replace(target, reference=played)
     u, x, feedback = (rotate_harmonics(_to_vector(fit), -lag_angle) for fit in fits)
-    measured = OrbitMeasurement(u, x, feedback, response)
+    noise_m = estimate_harmonic_error(correction_m, phase, plan.harmonics)
+    # A table that stands elsewhere moves the mass along: where it stands is no part of the orbit.
+    place = np.append(feedback[0], np.zeros(feedback.size - 1))
+    measured = OrbitMeasurement(u, x - place, feedback - place, response, noise_m)
     search = replace(
         search,
         lag_change_s=search.lag_change_s + late_s,
@@ -345,9 +348,8 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         )
         return retry_orbit(replace(state, search=search), stage.last, reason)
     command_m = orbit.acceleration_m_s2 * _find_correction(state, target.frequency_hz) / w**2
-    noise_m = estimate_harmonic_error(correction_m, phase, plan.harmonics)
     level_ratio = abs(nominal) / orbit.acceleration_m_s2
-    reason = _find_fault(config, target, measured, command_m, noise_m, level_ratio)
+    reason = _find_fault(config, target, measured, command_m, level_ratio)
     has_ended = not reason or target.update >= config.updates
     if has_ended:
         # What feedback within its noise or tolerance moves u by is known to the first order.
@@ -462,11 +464,10 @@ def _find_fault(
     target: OrbitTarget,
     measured: OrbitMeasurement,
     command_m: float,
-    noise_m: float,
     level_ratio: float,
 ) -> str:
     """Return why a held motion is not an orbit of the table without feedback; "" if it is."""
-    if measured.feedback_m > max(config.tolerance * command_m, NOISE_FACTOR * noise_m):
+    if measured.feedback_m > max(config.tolerance * command_m, NOISE_FACTOR * measured.noise_m):
         return f"the feedback is {100 * measured.feedback_m / command_m:.2g} % of the command"
     if not is_on_branch(config.orbit_plan, target, measured):
         return "the amplitude is not that of the sought branch"

@@ -25,7 +25,7 @@ from table_io.control.orbit_feedback import FeedbackState, evaluate_harmonics
 from table_io.records import OrbitPoint
 from table_io.sequencer.state import OrbitSearch, ReleaseSeries, SequencerState
 
-MAX_DEPARTURE = 0.03  # of the amplitude of u: the feedback acts again
+MAX_DEPARTURE = 0.02  # of the amplitude of u: the feedback acts again
 MAX_CONTACT_CHANGE = 0.3  # the same, of the way from a turning point of u to a bumper
 MAX_PUSH = 0.003  # of the fundamental of x
 GROWTH_PERIODS = 2.5  # from a push to the largest departure, by the planned multiplier

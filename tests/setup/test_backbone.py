@@ -127,7 +127,7 @@ def test_backbone_is_that_of_the_plant(measured) -> None:
 @pytest.mark.slow  # 14 s with those of the same session
 def test_feedback_vanished_in_phase_within_100_periods(measured) -> None:
     for point in measured[1].select(OrbitPoint):
-        assert math.hypot(*point.feedback_m) <= 0.003 * point.command_m
+        assert point.feedback_size_m <= 0.003 * point.command_m
         assert math.degrees(math.atan2(point.u_m[3], point.u_m[2])) == pytest.approx(0.0, abs=1.0)
         assert point.periods <= 100
 

@@ -60,8 +60,15 @@ def test_range_that_begins_between_the_folds_is_reached_from_below_the_lower_one
     unstable_hz = [point.frequency_hz for point in plan.points if not point.stable]
     assert unstable_hz == sorted(unstable_hz)
     assert unstable_hz[0] < 2.83
-    assert abs(sum(f >= start_hz for f in unstable_hz) - 8) <= 1
-    assert max(np.diff(unstable_hz)) < 0.25
+    assert sum(f >= start_hz for f in unstable_hz) >= 7
+
+
+def test_a_coarse_plan_has_no_orbit_far_from_the_next() -> None:
+    """A limited feedback cannot reach from one of three orbits to the next; it can of 25."""
+    unstable = [p for p in make_orbit_plan(Model(snm()), RANGE_HZ, AG, 3, FEEDBACK_TIMING).points
+                if not p.stable]  # fmt: skip
+    assert len(unstable) in (25, 26)
+    assert max(np.diff([point.amplitude_m for point in unstable])) < 0.35e-3
 
 
 def test_orbits_of_the_plan_are_those_of_the_model(plan):
@@ -140,7 +147,7 @@ def test_limits_and_duration_count_the_feedback_and_its_updates(planned_config):
         steady_m = orbit.acceleration_m_s2 / (2 * math.pi * orbit.frequency_hz) ** 2
         least_m = (1 + continuation.max_feedback) * steady_m
         assert least_m * 0.999 < demand.displacement_m < 1.2 * least_m
-    cycles = 2 * (10 + 10 + 4) + 24
+    cycles = 2 * (10 + 10 + 4) + 32
     planned_s = config.drive.planned_end / config.drive.rate_hz
     assert config.expected_s - planned_s == pytest.approx(
         sum(cycles / orbit.frequency_hz for orbit in config.steps)

@@ -123,6 +123,12 @@ def test_a_short_impact_is_not_smoothed_into_its_swing(samples: int) -> None:
     assert find_steady_extremes(smooth + noisy - u, phase) is not None
 
 
+def test_the_mean_of_cycles_is_no_error_of_harmonics() -> None:
+    values, phase = wave(3.0, 10, [1.0])
+    means = np.random.default_rng(4).normal(0.0, 0.1, 11)[np.floor(phase - phase[0]).astype(int)]
+    assert estimate_harmonic_error(values + means, phase, 3) < 0.01
+
+
 def test_a_trend_between_cycles_is_no_noise_of_the_harmonics() -> None:
     phase = np.arange(800) / 100.0
     steady, trend = np.sin(2 * np.pi * phase), np.linspace(1.0, -0.5, phase.size)

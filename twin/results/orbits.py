@@ -26,7 +26,7 @@ def summarise_orbits(recording: Recording, plan: OrbitPlan) -> list[OrbitResult]
 
 
 def _summarise_orbit(orbit: OrbitPoint, plan: OrbitPlan) -> OrbitResult:
-    feedback = math.hypot(*orbit.feedback_m)
+    feedback = orbit.feedback_size_m
     planned = plan.points[orbit.step]
     return OrbitResult(
         index=orbit.step,

@@ -33,7 +33,9 @@ from twin.setup.feedback_gains import FeedbackTiming, interpolate_gains
 RANGE_MARGIN = 1.2  # ratio of frequencies by which the branch is followed beyond the range
 REFUSAL_MARGIN = 1.6  # the same, to tell where unstable orbits are
 LEAD_ORBITS = 3  # stable ones before and after the unstable ones
-LEAD_SPACING = 0.04  # of the unstable part, between orbits on the way from its fold to the range
+# Of the unstable part, largest distance of orbits from one to the next: the feedback, whose command
+# is limited, must hold each of them with what is known from the one before.
+MAX_SPACING = 0.04
 PLAN_HARMONICS = 9
 MODEL_ERROR = 0.05  # relative error of mass and of stiffness with which the gains must hold
 JITTER_S = 0.005  # of blocks that arrive late; the feedback horizon absorbs smaller ones
@@ -56,20 +58,22 @@ class UnstableStretch:
     def divide(self, range_hz: tuple[float, float], points: int) -> list[float]:
         """Return positions of unstable orbits in a range, evenly spaced, and of stable ones.
 
-        The stable ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds. A
-        range that begins between the folds is reached from below the lower one, where rest leads to
-        the branch: the orbits on the way are measured too, LEAD_SPACING apart.
+        There are more than `points` where these would be further than MAX_SPACING apart. The stable
+        ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds. A range that
+        begins between the folds is reached from below the lower one, where rest leads to the
+        branch: the orbits on the way are measured too.
         """
         frequencies = np.array([orbit.frequency_hz for orbit in self.orbits])
         fine = np.linspace(0.0, 1.0, FINE_POSITIONS)
         fine_hz = np.interp(fine, self.positions, frequencies)
         inside = fine[(fine_hz >= range_hz[0]) & (fine_hz <= range_hz[1])]
         low, high = float(inside[0]), float(inside[-1])
+        points = max(points, math.ceil((high - low) / MAX_SPACING))
         numbers = np.arange(-LEAD_ORBITS, points + LEAD_ORBITS) + 0.5
         positions = low + numbers / points * (high - low)
         last = self.positions[-1] if high == 1.0 else high
         if low > 0.0:
-            way = LEAD_SPACING * (np.arange(-LEAD_ORBITS, math.ceil(low / LEAD_SPACING)) + 0.5)
+            way = MAX_SPACING * (np.arange(-LEAD_ORBITS, math.ceil(low / MAX_SPACING)) + 0.5)
             positions = np.append(way[way < low], positions[positions > low])
         return [float(p) for p in positions if self.positions[0] <= p <= last]
 
@@ -100,8 +104,9 @@ def make_orbit_plan(
 ) -> OrbitPlan:
     """Return the plan of a continuation through the unstable orbits of a model in a range.
 
-    `points` unstable orbits, evenly spaced along the branch, and LEAD_ORBITS stable ones on either
-    side. InputError if there are none, or if the latency is too large, with the largest allowed.
+    At least `points` unstable orbits, evenly spaced along the branch, and LEAD_ORBITS stable ones
+    on either side. InputError if there are none, or if the latency is too large, with the largest
+    allowed.
     """
     period_map = make_period_map(model, range_hz[1], acceleration_m_s2)
     stretch = find_unstable_stretch(period_map, range_hz)

@@ -50,7 +50,7 @@ class PlannedOrbit(ConfigModel):
     The feedback to the command is gain (x - x_ref) + rate_gain_s (x' - x_ref'), `latency_s` later,
     of the mass's displacement x in the laboratory frame (u plus the table's). Fed back from u, the
     table's own correction would come back at a gain of about -gain, at every frequency above the
-    resonance: x holds all orbits of G4 at one pair of gains, about 0.7 and 0.005 s, up to 75 ms.
+    resonance: at 45 ms x holds the orbits of G4 with gains of 1.1 to 0.45 and -2 ms.
     """
 
     frequency_hz: Positive
@@ -195,7 +195,12 @@ class Continuation(Excitation):
     start_hz: Positive = Field(description="Frequency where the branch is entered.")
     stop_hz: Positive = Field(description="Frequency where it is left.")
     acceleration_g: Positive = Field(0.05, description="Peak table acceleration.")
-    points: Count = Field(60, ge=1, le=1000, description="Unstable orbits along the branch.")
+    points: Count = Field(
+        60,
+        ge=1,
+        le=1000,
+        description="Unstable orbits along the branch; more where they would lie too far apart.",
+    )
     settle_cycles: Count = Field(10, ge=2, le=1000, description="Before each evaluation.")
     measured_cycles: Count = Field(10, ge=2, le=1000, description="Of each evaluation.")
     blend_cycles: Number = Field(4.0, ge=MIN_BLEND_CYCLES, le=50, description="Between orbits.")
@@ -210,7 +215,7 @@ class Continuation(Excitation):
         description="Largest amplitude of the feedback over that of the command.",
     )
     multiplier_periods: Count = Field(
-        24,
+        32,
         ge=0,
         le=1000,
         description="Of an accepted orbit, to measure its Floquet multiplier; 0: not measured.",

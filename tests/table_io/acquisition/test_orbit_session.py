@@ -12,6 +12,7 @@ import pytest
 
 from table_io.acquisition.external_control import plan_open_loop_drive
 from table_io.acquisition.session import OperatorCommand
+from table_io.adaptive.continuation import OrbitMeasurement
 from table_io.block import Block
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
@@ -30,7 +31,7 @@ from tests.table_io.sim.plant_orbits import trace_orbits
 
 PLAN = json.loads(Path(__file__).with_name("unstable_orbits.json").read_text(encoding="utf-8"))
 RATE_HZ = 2000.0
-MULTIPLIER_PERIODS = 24  # by default
+MULTIPLIER_PERIODS = 64  # twice the default: two orbits, both of which are to have one
 # Of the simulated plant itself with payload reaction (`plant_orbits.py`): f in Hz, |U_1| in mm,
 # largest Floquet multiplier.
 TRUE_ORBITS = np.array(
@@ -61,7 +62,7 @@ def make_profile(
 
 @pytest.fixture(scope="module")
 def held() -> PlayedSession:
-    return play_session(make_profile())
+    return play_session(make_profile(multiplier_periods=MULTIPLIER_PERIODS))
 
 
 def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> None:
@@ -71,7 +72,7 @@ def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> 
         (1, True, ""),
     ]
     for point in points:
-        assert math.hypot(*point.feedback_m) <= 0.003 * point.command_m
+        assert point.feedback_size_m <= 0.003 * point.command_m
         assert not point.stable
         assert point.acceleration_m_s2 == pytest.approx(0.49033, rel=0.006)
         assert point.periods <= 150 + MULTIPLIER_PERIODS
@@ -83,7 +84,7 @@ def test_orbit_is_accepted_at_the_noise_that_its_feedback_has() -> None:
     noisy = play_session(make_profile(slice(1), multiplier_periods=0, tolerance=1e-4))
     (point,) = noisy.select(OrbitPoint)
     assert point.accepted
-    assert 1e-4 * point.command_m < math.hypot(*point.feedback_m) <= 1.5 * point.noise_m
+    assert 1e-4 * point.command_m < point.feedback_size_m <= 1.5 * point.noise_m
     true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
     assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=0.002)
 
@@ -109,8 +110,25 @@ def test_measured_orbits_are_those_of_the_plant(held: PlayedSession) -> None:
     for point in held.select(OrbitPoint):
         true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
         # 3e-4 with what the feedback left moves u by
-        assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=2e-4)
+        assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=5e-4)
         assert point.amplitude_m > math.hypot(*point.u_m[2:4])
+
+
+def test_where_the_table_stands_is_no_part_of_an_orbit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plan whose mean of u is off by 30 um shifts table and mass alike: no fault, no change."""
+    measured: list[OrbitMeasurement] = []
+    find_fault = orbits._find_fault
+
+    def record(*arguments: Any) -> str:
+        measured.append(arguments[2])
+        return find_fault(*arguments)
+
+    monkeypatch.setattr(orbits, "_find_fault", record)
+    planned = dict(PLAN["points"][0])
+    (mean_m, _), *others = planned["u_m"]
+    planned["u_m"] = [[mean_m + 3e-5, 0.0], *others]
+    play_session(make_profile(planned=planned, multiplier_periods=0))
+    assert [abs(each.x[0] - each.u[0]) < 3e-6 for each in measured] == [True] * len(measured)
 
 
 def test_measured_multipliers_are_those_of_the_plant(held: PlayedSession) -> None:
@@ -137,7 +155,7 @@ def find_stated_peak(held: PlayedSession) -> float:
     profile = make_profile()
     drive = procedure.nominal_drive(procedure.make_test_plan(profile, RIG, 40))
     stated = max(row.acceleration_m_s2 for row in compute_demands(drive, profile, RIG))
-    assert stated <= 1.43 * 0.49033
+    assert stated <= 1.15 * 0.49033
     correction = max(
         p.command_m * (math.tau * p.frequency_hz) ** 2 for p in held.select(OrbitPoint)
     )

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.signal import butter, sosfilt
 
 from table_io.adaptive.jump_refinement import choose_part
 from table_io.adaptive.policy import describe_adaptive_test, make_policy
@@ -526,10 +527,14 @@ def test_swing_is_the_mean_over_whole_cycles() -> None:
 
 @pytest.mark.parametrize("noise_m", [0.0, 5e-6, 15e-6, 30e-6])
 @pytest.mark.parametrize("cycles", [4, 10])
+@pytest.mark.parametrize("corner_hz", [None, 200.0])
 def test_swing_of_an_orbit_does_not_grow_with_the_noise_of_its_sensor(
-    noise_m: float, cycles: int
+    noise_m: float, cycles: int, corner_hz: float | None
 ) -> None:
-    """A motion with even and odd harmonics, as next to bumpers; its true swing by a fine grid."""
+    """A motion with even and odd harmonics, as next to bumpers; its true swing by a fine grid.
+
+    The noise is white, or it passed the filter of a sensor and is alike in successive samples.
+    """
     orders, sizes = np.arange(1, 8), 2.3e-3 / np.arange(1, 8) ** 2.5
 
     def motion(phase: np.ndarray) -> np.ndarray:
@@ -541,7 +546,10 @@ def test_swing_of_an_orbit_does_not_grow_with_the_noise_of_its_sensor(
     for seed in range(12):
         rng = np.random.default_rng(seed)
         phase = rng.random() + np.arange(round(cycles * 2000 / 3.37)) * 3.37 / 2000
-        u = motion(phase) + noise_m * rng.standard_normal(phase.size)
+        noise = rng.standard_normal(phase.size)
+        if corner_hz is not None:
+            noise = sosfilt(butter(4, corner_hz, fs=2000.0, output="sos"), noise)
+        u = motion(phase) + noise_m * noise
         errors.append(mean_swing(u, phase) - true)
     assert abs(np.mean(errors)) < 2e-6
     assert np.abs(errors).max() < max(1e-7, 0.25 * noise_m)

@@ -1,6 +1,7 @@
 """Continuation: Newton steps on a linear specimen with feedback, and through a fold."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -110,6 +111,26 @@ def test_broyden_corrects_a_wrong_jacobian() -> None:
         target = correct_target(plan, target, measured)
     assert sizes[-1] < 0.02 * sizes[0]
     assert np.abs(target.reference - u - table).max() < 0.02 * fundamental(u)
+
+
+def test_broyden_learns_no_derivative_from_noise() -> None:
+    """Changes of 5 um tell the derivative where the feedback is known to 0.1 um, not to 10 um."""
+    f, ratio = 3.4, linear_response(3.4, 200e3)
+    jacobian, table = real_matrix(ratio), table_harmonics(3.4, A, 1)
+    u = jacobian @ table
+    plan = OrbitPlan(
+        harmonics=1, latency_s=0.046, points=(make_orbit(f, complex(u[1], u[2]), jacobian),)
+    )
+    target, shift = plan_target(plan, 0, ()), np.array([0.0, 3e-6, 4e-6])
+    first = hold(target.reference, u + table + shift, jacobian, 0.5 - 0.3j)
+    errors = []
+    for noise_m in (1e-7, 1e-5):
+        second = correct_target(plan, target, first)
+        moved = replace(first, x=first.x + np.array([0.0, 2e-5, -2e-5]), noise_m=noise_m)
+        slopes = correct_target(plan, second, moved).slopes
+        errors.append(float(np.abs(slopes - target.slopes).max()))
+    assert errors[0] > 0.3
+    assert errors[1] < 0.1
 
 
 def test_phase_resonance_of_a_linear_specimen_is_found_by_the_measured_phase() -> None:

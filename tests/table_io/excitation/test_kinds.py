@@ -167,7 +167,7 @@ def test_demands_cover_command_and_stop(kind: str) -> None:
     continuation = profile(kind).continuation
     feedback = np.ones(3)
     if continuation is not None:  # |q'|^2 <= 2 |q| |q''|
-        d, a = 1.0 + continuation.max_feedback, 1.4
+        d, a = 1.0 + continuation.max_feedback, 1.125
         feedback = np.array([d, math.sqrt(2.0 * d * a), a])
     assert np.max(played, axis=0) == pytest.approx(feedback * own, rel=0.06)
     if rows[-1].direction == "a stop":
