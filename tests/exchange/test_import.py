@@ -248,6 +248,17 @@ def test_mass_and_gap_are_stated_without_a_profile_or_in_it(
         )  # fmt: skip
 
 
+def test_a_file_too_slow_for_a_model_is_referred_to_another_model(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    profile = tmp_path / "light.toml"
+    text = (run[0] / "quick.toml").read_text()
+    profile.write_text(text.replace("mass_kg = 550.0", "mass_kg = 0.5"))
+    assert "mass_kg = 0.5" in profile.read_text()
+    with raises_input_error(key="rate_hz", problem="too low for the bumper", remedy="model of this"):
+        import_table(run[0] / "table.csv", tmp_path / "l.mcap", ImportOptions(profile=profile))
+
+
 def test_import_table_prefers_labels_to_detected_steps(
     run: tuple[Path, Recording], tmp_path: Path
 ) -> None:

@@ -68,6 +68,10 @@ step_hz = {hz!r}
 cycles = {cycles}
 measured_cycles = {measured}
 """
+OTHER_MODEL = (
+    "state a model of this specimen in the profile in place of {model}, or import without a profile, "
+    "with --mass and --gap"
+)
 NO_PROFILE_NOTE = "Imported without a profile: {mass}, {bumpers}."
 PLAIN_MODEL = """\
 title = "Placeholder: {hz:.3g} Hz, 5 % damping; the specimen is unknown, give --model"
@@ -390,7 +394,12 @@ def _build_run_config(
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
     if test_profile.acquisition.rate_hz != rate_hz:
         text = _set_rate(text, rate_hz)
-    return from_texts(profile.stem, text, rig_toml, model_toml, source)
+    try:
+        return from_texts(profile.stem, text, rig_toml, model_toml, source)
+    except InputError as error:
+        if error.key != "rate_hz":
+            raise
+        raise error.replace(remedy=OTHER_MODEL.format(model=test_profile.model)) from None
 
 
 def _build_placeholder(
