@@ -34,9 +34,7 @@ def build(columns: Float2D, residual: np.ndarray, noise: Float2D | None = None) 
     products = columns @ columns.T
     true = products if noise is None else products - noise
     scale = np.sqrt(np.diag(products))
-    return LinearEvidence(
-        variants, {}, true, products, -columns @ residual, scale, FORCE, 1.0, 1.0, residual
-    )
+    return LinearEvidence(variants, {}, true, products, -columns @ residual, scale, FORCE, 1.0, 1.0)
 
 
 def draw(count: int, seed: int) -> Float2D:

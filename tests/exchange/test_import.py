@@ -255,7 +255,7 @@ def test_a_file_too_slow_for_a_model_is_referred_to_another_model(
     text = (run[0] / "quick.toml").read_text()
     profile.write_text(text.replace("mass_kg = 550.0", "mass_kg = 0.5"))
     assert "mass_kg = 0.5" in profile.read_text()
-    with raises_input_error(key="rate_hz", problem="too low for the bumper", remedy="model of this"):
+    with raises_input_error(key="rate_hz", problem="too low", remedy="a model of this specimen"):
         import_table(run[0] / "table.csv", tmp_path / "l.mcap", ImportOptions(profile=profile))
 
 

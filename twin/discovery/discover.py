@@ -144,7 +144,7 @@ def prepare_problem(
         )
     notes += [
         f"{residuals.signals.name}: no rest and no repeated cycle shows the noise; it is taken "
-        "from what redundant sensors, and all candidates together, leave"
+        "from redundant sensors and from quiet bands, and may be louder"
         for residuals in log_residuals
         if not residuals.knows_noise
     ]
@@ -297,8 +297,6 @@ def discover_effects(
     prepared = prepare_problem(logs, model, without, mapper)
     once = (RoundEffort(),)
     selection = select_effects(prepared.problem, prepared.parameters, report, rounds=once)
-    if selection.evidence is not None:
-        prepared = replace(prepared, problem=prepared.problem.with_noise_of(selection.evidence))
     if selection.best.effects and selection.complete:
         # the errors of instruments were linear about a model without these effects
         prepared = _linearize_about(prepared, selection.best)

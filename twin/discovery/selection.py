@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -86,20 +86,6 @@ class SelectionProblem:
     log_residuals: tuple[LogResiduals, ...]
     library: tuple[Candidate, ...]
     mapper: MapFunction = map
-    # Level of the forces that is noise: above 1 where nothing but the residual shows the noise.
-    noise_level: float = 1.0
-
-    def with_noise_of(self, evidence: LinearEvidence[Candidate]) -> "SelectionProblem":
-        """Return the problem with the noise that the richest model leaves, if none else shows it.
-
-        An effect that neither the library nor a smooth force resembles counts as noise then.
-        """
-        if all(residuals.knows_noise for residuals in self.log_residuals):
-            return self
-        ends = np.cumsum([residuals.entry_row.size for residuals in self.log_residuals])
-        left = np.split(evidence.left, ends[:-1])
-        level = measure_level(self.log_residuals, left, forces_only=True)
-        return replace(self, noise_level=max(1.0, level))
 
     def fit_effects(self, start: ParameterSet, effects: Sequence[Candidate]) -> FittedSet:
         """Fit `start`, with these effects added, to all data, with cross-validation residuals."""
@@ -188,8 +174,7 @@ class SelectionProblem:
 
     def leaves_noise(self, fitted: FittedSet) -> bool:
         """Return True if what a set leaves of the forces is noise, its own included."""
-        noise = max(self.noise_level, self.measure_noise(fitted))
-        return self.measure_level(fitted) <= MAX_LEVEL * noise
+        return self.measure_level(fitted) <= MAX_LEVEL * max(1.0, self.measure_noise(fitted))
 
     def is_explained_by(self, fit: FitResult) -> bool:
         """Return True if a fit leaves no more than noise of the forces, on the data fitted."""

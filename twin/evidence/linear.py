@@ -96,7 +96,6 @@ class LinearEvidence(Generic[C]):
     force: float  # norm of the measured forces
     inflation: float  # of the covariance of the scores, which holds it
     level: float  # mean square over noise and unknown errors that the richest model leaves
-    left: Float1D  # what that model leaves, (entry,)
     unknown_share: float = 0.0
 
     @cached_property
@@ -297,7 +296,7 @@ def absorb_base(
     raw, chance = (
         _absorb(of, absorbed, base) * np.outer(kept_share, kept_share) for of in (raw, noise)
     )
-    inflation, level, left = _measure_inflation(rest, raw, unit, count, rich, expected)
+    inflation, level = _measure_inflation(rest, raw, unit, count, rich, expected)
     covariance = inflation * (raw + chance)[:-1, :-1] * np.outer(own_scale, own_scale)
     covariance += np.diag(np.where(is_left, MIN_INFORMATION_SHARE * own_scale**2, 1.0))
     places = {
@@ -307,7 +306,7 @@ def absorb_base(
     }
     return LinearEvidence(
         variants, places, _make_positive(products), covariance, scores, usable, force, inflation,
-        level, left, unknown_share,
+        level, unknown_share,
     )  # fmt: skip
 
 
@@ -328,8 +327,8 @@ def _make_positive(products: Float2D) -> Float2D:
 def _measure_inflation(
     rest: Float2D, products: Float2D, unit: Int1D, count: int, rich: Sequence[int],
     expected: Float1D,
-) -> tuple[float, float, Float1D]:  # fmt: skip
-    """Return variance inflation of scores, level, and what the richest model leaves, (entry,).
+) -> tuple[float, float]:  # fmt: skip
+    """Return (variance inflation of scores, level) of what the richest model leaves.
 
     That model has the stranger at every place, the columns `rich`, and the candidates that explain
     most beside them, because no smooth force has the jump of a friction: what is left scatters
@@ -358,7 +357,7 @@ def _measure_inflation(
     scatter = (sums**2).sum(axis=0) * effective / np.maximum(effective - 1.0, 1.0)
     ratios = scatter / np.maximum(columns**2 @ left**2, 1e-300)
     correlated = float(np.median(ratios)) if ratios.size else 1.0
-    return max(1.0, correlated) * max(1.0, level), level, left
+    return max(1.0, correlated) * max(1.0, level), level
 
 
 def softmax(states: Sequence[Hypothesis]) -> Float1D:

@@ -69,8 +69,8 @@ cycles = {cycles}
 measured_cycles = {measured}
 """
 OTHER_MODEL = (
-    "state a model of this specimen in the profile in place of {model}, or import without a profile, "
-    "with --mass and --gap"
+    "state a model of this specimen in the profile in place of {model}, or import without a "
+    "profile, with --mass and --gap"
 )
 NO_PROFILE_NOTE = "Imported without a profile: {mass}, {bumpers}."
 PLAIN_MODEL = """\
