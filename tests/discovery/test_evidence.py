@@ -14,7 +14,13 @@ from twin.discovery.evidence import build_evidence
 from twin.discovery.law_terms import make_law_candidate
 from twin.discovery.parameters import ParameterSet
 from twin.discovery.residuals import LogResiduals
-from twin.evidence.linear import EFFECT_SHARE, UNKNOWN_ERROR_SHARE, LinearEvidence, Variant
+from twin.evidence.linear import (
+    EFFECT_SHARE,
+    UNKNOWN_ERROR_SHARE,
+    LinearEvidence,
+    Variant,
+    cover_unknown_errors,
+)
 from twin.laws.terms import FAMILIES
 
 ENTRIES, FORCE = 400, 100.0
@@ -85,7 +91,10 @@ def test_what_unknown_errors_may_imitate_is_no_effect(share: float, is_named: bo
     force = 10.0 / 0.001
     amplitude = share * force / np.linalg.norm(columns[1])
     sure = replace(build(columns, noise - amplitude * columns[1]), force=force)
-    careful = replace(sure, unknown_share=UNKNOWN_ERROR_SHARE)
+    unknown = cover_unknown_errors(
+        sure.variants, sure.products, sure.scale, force, UNKNOWN_ERROR_SHARE
+    )
+    careful = replace(sure, covariance=sure.covariance + unknown)
     assert sure.rank_states(2)[0].columns == (1,)
     assert careful.rank_states(2)[0].columns == ((1,) if is_named else ())
 

@@ -42,6 +42,7 @@ from twin.system.process_pool import map_in_threads
 MAX_EFFECTS, MAX_ROUNDS, MAX_REFITS = 2, 3, 3
 FOLD_COUNT = 3  # blocks of time are held out by turns
 MAX_EVALUATIONS = 12  # of a fit with an effect, which begins near its solution
+REWEIGHTED_EVALUATIONS = 4  # of one of which only the weights have changed
 WARM_TOLERANCE = 1e-3  # relative fall of the squares at which that fit ends
 MAX_WARM_GAP = 0.25  # beyond it the parameters of the twin without the effect are no start
 LEAST_NOISE = 1e-4  # of the motion: no reading is better, and the noise is never taken as less
@@ -268,13 +269,16 @@ _Searched = tuple[TableProblem, Selection[FittedTable, TableEffect]]
 
 
 def _fit_effects(
-    rehearsal: RehearsalProblem, effects: Sequence[TableEffect], start: Mapping[str, float]
+    rehearsal: RehearsalProblem,
+    effects: Sequence[TableEffect],
+    start: Mapping[str, float],
+    evaluations: int = MAX_EVALUATIONS,
 ) -> FittedTable:
     """Return a fit with some effects, from values near it."""
     bounds = {name: ends for effect in effects for name, ends in effect.bounds.items()}
     free = {**BOUNDS, **bounds}
     start = {name: start[name] for name in free}
-    fit = fit_table(rehearsal, free, start, MAX_EVALUATIONS, WARM_TOLERANCE)
+    fit = fit_table(rehearsal, free, start, evaluations, WARM_TOLERANCE)
     return FittedTable(tuple(effects), fit)
 
 
@@ -287,23 +291,26 @@ def discover_table_effects(
         names = " and ".join(name.replace("_", " ") for name in progress.names)
         report(f"fitting {names}" if names else "comparing the effects of a table")
 
-    def search(fit: TableFit, effects: Sequence[TableEffect], count: int) -> _Searched:
-        """Search with the weights by which what a fit with some effects leaves is white."""
-        rehearsal = fit.problem.whiten(fit)
-        null = _fit_effects(rehearsal, (), fit.scaled_values)
-        first = _fit_effects(rehearsal, effects, fit.scaled_values) if effects else None
+    def search(about: FittedTable, null: FittedTable, count: int) -> _Searched:
+        """Search with the weights by which what a set leaves is white."""
+        rehearsal = about.fit.problem.whiten(about.fit)
+        null, *first = (
+            _fit_effects(rehearsal, each.effects, each.fit.scaled_values, REWEIGHTED_EVALUATIONS)
+            for each in dict.fromkeys((null, about))
+        )
         problem = TableProblem(rehearsal)
         rounds = (RoundEffort(max_effects=MAX_EFFECTS, max_refits=MAX_REFITS),) * count
-        return problem, search_sets(problem, null, tell, first, rounds)
+        return problem, search_sets(problem, null, tell, first[0] if first else None, rounds)
 
-    problem, selection = search(basic, (), 1)
+    without = FittedTable((), basic)
+    problem, selection = search(without, without, 1)
     if selection.best.effects:
-        problem, selection = search(selection.best.fit, selection.best.effects, MAX_ROUNDS)
+        problem, selection = search(selection.best, selection.null, MAX_ROUNDS)
     verdict = judge_selection(problem, selection)
-    fitted = without = FittedTable((), basic)
+    fitted = without
     if (best := verdict.best).effects:
         own = _fit_effects(basic.problem, best.effects, best.fit.scaled_values)
-        fitted = problem.select_simplest((without, own))
+        fitted = min(own, without, key=lambda each: each.gap)
     return EffectDiscovery(selection, verdict, without, fitted)
 
 

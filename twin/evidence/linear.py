@@ -81,9 +81,7 @@ class Hypothesis:
 class LinearEvidence(Generic[C]):
     """Linear model about a fit: products after the base has been absorbed.
 
-    With an `unknown_share` even the null has each effect, with that standard deviation of its force
-    over that of the record: errors of no known form imitate as much of any effect. `products`
-    (column, column) and `scores` (column,) of candidates and stranger, over the noise,
+    `products` (column, column) and `scores` (column,) of candidates and stranger, over the noise,
     and the `covariance` of the scores; `scale` are the norms of the columns as they are.
     """
 
@@ -96,7 +94,6 @@ class LinearEvidence(Generic[C]):
     force: float  # norm of the measured forces
     inflation: float  # of the covariance of the scores, which holds it
     level: float  # mean square over noise and unknown errors that the richest model leaves
-    unknown_share: float = 0.0
 
     @cached_property
     def _precision(self) -> Float1D:
@@ -116,14 +113,6 @@ class LinearEvidence(Generic[C]):
             for share in STRANGER_SHARES
         ]
         return float(np.logaddexp.reduce(evidences)) - math.log(len(evidences))
-
-    def _compare(self, sets: Int1D, precision: Float2D) -> tuple[Float1D, Float2D, Float2D]:
-        """Return what `_weigh` does, with the evidence over that of unknown errors alone."""
-        evidence, amplitudes, deviations = self._weigh(sets, precision)
-        if self.unknown_share:
-            known = (EFFECT_SHARE / self.unknown_share) ** 2 * self._precision[sets]
-            evidence = evidence - self._weigh(sets, known)[0]
-        return evidence, amplitudes, deviations
 
     def _inform(self, sets: Int1D) -> tuple[Float2D, Float2D]:
         """Return (information I (set, column, column), g (set, column)) of sets of columns."""
@@ -148,7 +137,7 @@ class LinearEvidence(Generic[C]):
     def _measure(self, columns: Sequence[int], precision: Float1D) -> float:
         if not columns:
             return 0.0
-        return float(self._compare(np.array([columns]), precision[None, :])[0][0])
+        return float(self._weigh(np.array([columns]), precision[None, :])[0][0])
 
     def estimate(self, columns: Sequence[int]) -> tuple[Float1D, Float1D]:
         """Return (amplitudes, their standard deviations) of a set, (column,) each."""
@@ -241,7 +230,7 @@ class LinearEvidence(Generic[C]):
         if not sets:
             return []
         table = np.array(sets)
-        evidence, amplitudes, deviations = self._compare(table, self._precision[table])
+        evidence, amplitudes, deviations = self._weigh(table, self._precision[table])
         signs = np.array([variant.sign for variant in self.variants])[table]
         allowed = (signs * amplitudes >= -deviations).all(axis=1)
         prior = self.log_prior(table.shape[1], False)
@@ -299,6 +288,7 @@ def absorb_base(
     inflation, level = _measure_inflation(rest, raw, unit, count, rich, expected)
     covariance = inflation * (raw + chance)[:-1, :-1] * np.outer(own_scale, own_scale)
     covariance += np.diag(np.where(is_left, MIN_INFORMATION_SHARE * own_scale**2, 1.0))
+    covariance += cover_unknown_errors(variants, products, usable, force, unknown_share)
     places = {
         place: columns_of[is_left[columns_of]]
         for place, columns_of in places.items()
@@ -306,8 +296,26 @@ def absorb_base(
     }
     return LinearEvidence(
         variants, places, _make_positive(products), covariance, scores, usable, force, inflation,
-        level, unknown_share,
+        level,
     )  # fmt: skip
+
+
+def cover_unknown_errors(
+    variants: Sequence[Variant[C]], products: Float2D, scale: Float1D, force: float, share: float
+) -> Float2D:
+    """Return the covariance of the scores if errors of no known form imitate every effect.
+
+    Each candidate by `share` of the force of the record, rms, whichever explanation is right.
+    """
+    names = [variant.candidate.name for variant in variants]
+    count = np.array([names.count(name) for name in names])
+    amplitude = np.zeros(scale.size)
+    own = scale[: count.size]
+    amplitude[: count.size] = np.divide(
+        share * force, own * np.sqrt(count), out=np.zeros(own.size), where=own > 0
+    )
+    imitated = products * amplitude
+    return imitated @ imitated.T
 
 
 def _absorb(products: Float2D, absorbed: Float2D, base: int) -> Float2D:
