@@ -1,15 +1,18 @@
 """Customer's report: what it states is what the recording holds, and its PDF is a whole file."""
 
+from io import BytesIO
 from pathlib import Path
 
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_pdf import PdfPages
 
 from tests.command_line import call_main
 from tests.setup.test_swept_prediction import PROFILE
 from twin.archive.query import index_runs
 from twin.inspection.folder_report import write_folder_report
 from twin.recording.reader import read_recording
-from twin.report.customer_report import build_customer_report
+from twin.report.customer_report import MARGIN, _SheetWriter, build_customer_report
 from twin.report.report import load_report_data
 
 TEXTS = """
@@ -39,8 +42,9 @@ def test_customer_report_states_texts_limits_and_the_stop(folder: Path) -> None:
     assert cover["Laboratory"] == "Shake & Co"
     assert len(cover["Recording, SHA-256"]) == 64
     sections = {section.title: section for section in report.sections}
-    assert ("Limit of mass_acc_m_s2", "1.2 SI: stop") in sections["Set-up"].rows
-    assert ("Excitation, directions", "forward") in sections["Set-up"].rows
+    assert ("Limit of mass_acc_m_s2", "1.2 m/s2: stop") in sections["Set-up"].rows
+    assert ("Excitation: order of the passes", "forward") in sections["Set-up"].rows
+    assert ("Excitation: lowest frequency", "0.8 Hz") in sections["Set-up"].rows
     assert [row[0] for row in sections["Instruments"].rows][:2] == ["drive_disp_m", "table_disp_m"]
     deviations = " ".join(sections["Deviations"].lines)
     assert "The test was aborted" in deviations
@@ -60,6 +64,17 @@ def test_sweep_that_was_stopped_is_no_whole_pass_on_any_surface(folder: Path) ->
     assert summary.excitation_verdict.worst_error == max(ends, key=abs)
     (row,) = index_runs(folder.parent)
     assert row.level_g == pytest.approx(0.05)
+
+
+def test_no_cell_of_two_columns_is_wider_than_the_sheet() -> None:
+    """The longest that is stated, a hash in hexadecimal digits, wraps within the margins."""
+    with BytesIO() as file, PdfPages(file) as pdf:
+        writer = _SheetWriter(pdf, "Title")
+        writer._write_rows([("Recording, SHA-256", "d" * 64)])
+        figure = writer._figure
+        renderer = FigureCanvasAgg(figure).get_renderer()
+        ends = [text.get_window_extent(renderer).x1 / figure.bbox.width for text in figure.texts]
+    assert max(ends) <= 1.0 - MARGIN + 1e-6
 
 
 def test_customer_report_is_a_page_and_a_pdf(folder: Path) -> None:

@@ -475,7 +475,15 @@ def _find_whole_block(recording: Recording, needed: Sequence[str] = CHANNELS) ->
     if missing:
         raise InputError(f"it has no {', '.join(missing)}", where=recording.path)
     used = [name for name in (*CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]
-    rows = [blocks[0].channel(name) for name in used]
-    if not all(np.isfinite(row).all() for row in rows):
-        raise InputError("samples were lost in it", where=recording.path)
+    for name in used:
+        lost = np.flatnonzero(~np.isfinite(blocks[0].channel(name)))
+        if lost.size:
+            raise InputError(
+                f"{lost.size} samples were lost or clipped, the first at "
+                f"{lost[0] / blocks[0].rate_hz:.1f} s",
+                where=recording.path,
+                key=name,
+                remedy="leave that part out at the import, or record the motion again in the range "
+                "of the sensor",
+            )
     return blocks[0]

@@ -3,6 +3,7 @@
 Title, set-up, instruments with their calibration, demand and achieved, deviations, signatures.
 """
 
+import re
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,8 +12,11 @@ from pathlib import Path
 import matplotlib as mpl
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
+from pydantic import BaseModel
 
 from table_io.config.base import parse_toml
+from table_io.config.channel import read_channels
+from table_io.config.key_reference import derive_unit
 from table_io.config.profile import Profile
 from table_io.records import SampleGap
 from table_io.units import GRAVITY_M_S2
@@ -92,6 +96,7 @@ INSTRUMENT_HEADERS = ("channel", "instrument", "serial", "sensitivity", "calibra
 
 def _list_set_up(run: ReportData, profile: Profile) -> Rows:
     rig = parse_toml_tables(run.recording.start.rig_toml)
+    channels = read_channels(run.recording.start.rig_toml)
     excitation = profile.excitation.model_dump(exclude_unset=True, exclude={"files", "prediction"})
     gaps = "none" if run.gaps_m is None else " and ".join(f"{1e3 * g:g} mm" for g in run.gaps_m)
     rows = [
@@ -99,19 +104,33 @@ def _list_set_up(run: ReportData, profile: Profile) -> Rows:
         ("Moving mass of the specimen", f"{profile.specimen.mass_kg:g} kg"),
         ("Gap of the bumpers, right and left", gaps),
         ("Sampling", f"{profile.acquisition.rate_hz:g} Hz"),
-        *((f"Excitation, {name}", _format_value(value)) for name, value in excitation.items()),
+        *(_describe_setting(profile.excitation, *entry) for entry in excitation.items()),
         ("Alarm and stop of the level",
-         f"+-{100 * profile.protection.alarm:g} %, +-{profile.protection.abort_db:g} dB"),
+         f"±{100 * profile.protection.alarm:g} %, ±{profile.protection.abort_db:g} dB"),
     ]  # fmt: skip
     rows += [
-        (f"Limit of {entry.channel}", f"{entry.limit:g} {entry.unit or 'SI'}: {entry.action}")
+        (
+            f"Limit of {entry.channel}",
+            f"{entry.limit:g} {entry.unit or channels[entry.channel].unit}: {entry.action}",
+        )
         for entry in profile.limits
     ]
     return [*rows, *([("Notes", profile.notes)] if profile.notes else [])]
 
 
+def _describe_setting(settings: BaseModel, key: str, value: object) -> tuple[str, str]:
+    """Return what a key of the excitation states, in words, and its value with the unit."""
+    described = type(settings).model_fields[key].description or key.replace("_", " ")
+    words = re.split(r"[.:;]", described)[0]
+    text = _format_value(value)
+    text = text.replace("_", " ") if key == "kind" else f"{text} {derive_unit(key)}".strip()
+    return f"Excitation: {words[:1].lower()}{words[1:]}", text
+
+
 def _format_value(value: object) -> str:
-    return ", ".join(map(_format_value, value)) if isinstance(value, tuple | list) else f"{value}"
+    if isinstance(value, tuple | list):
+        return ", ".join(map(_format_value, value))
+    return f"{value:g}" if isinstance(value, float) else f"{value}"
 
 
 def _list_instruments(run: ReportData) -> Rows:
@@ -136,7 +155,7 @@ def _list_results(run: ReportData) -> tuple[Rows, tuple[str, ...]]:
         rows = [
             ("Passes", f"{swept.passes} of {swept.planned_passes}"),
             ("Level measured on", ", ".join(swept.control_channels)),
-            (f"Time within +-{100 * swept.tolerance:g} %", f"{100 * swept.inside:.2f} %"),
+            (f"Time within ±{100 * swept.tolerance:g} %", f"{100 * swept.inside:.2f} %"),
             ("Least achieved over demanded",
              f"{swept.lowest_ratio:.3f} at {swept.lowest_hz:.4g} Hz"),
             ("Largest achieved over demanded",
@@ -296,7 +315,7 @@ class _SheetWriter:
             width = (1.0 - 2 * MARGIN) / len(row)
             places = [0.0, 0.3] if len(row) == 2 else [width * k for k in range(len(row))]
             size = 8.5 if len(row) <= 3 else 7.0
-            room = [34, 66] if len(row) == 2 else [round(150 / len(row))] * len(row)
+            room = [34, 52] if len(row) == 2 else [round(150 / len(row))] * len(row)
             cells = [textwrap.wrap(c, n) or [""] for c, n in zip(row, room, strict=True)]
             for number in range(max(map(len, cells))):
                 self._need(LINE)

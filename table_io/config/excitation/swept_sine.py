@@ -42,7 +42,7 @@ class SweptSine(Excitation):
 
     start_hz: Positive = Field(ge=0.1, description="Lowest frequency.")
     stop_hz: Positive = Field(description="Highest frequency.")
-    octaves_per_min: Number = Field(1.0, gt=0, le=10, description="Sweep rate.")
+    octaves_per_min: Number = Field(1.0, gt=0, le=10, description="Sweep rate, octaves a minute.")
     directions: tuple[Literal["forward", "backward"], ...] = Field(
         ("forward", "backward"), min_length=1, max_length=2, description="Order of the passes."
     )
