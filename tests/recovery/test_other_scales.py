@@ -7,7 +7,7 @@ import pytest
 
 from tests.studies.evidence.imported import import_columns
 from tests.studies.evidence.laboratory import Specimen, record
-from tests.studies.evidence.worlds import Motion, draw_world
+from tests.studies.evidence.worlds import Motion, draw_world, state_specimen
 from twin.discovery.result import Verdict
 from twin.discovery.task import discover
 
@@ -23,7 +23,7 @@ def judge(seed: int, folder: Path) -> Judged:
     """Discover what a clean recording of a laboratory of the study lacks."""
     specimen, lab, motion, _, _ = draw_world(seed)
     columns = record(specimen, lab, seed, motion)
-    log = import_columns(columns, folder, mass_kg=specimen.mass)
+    log = import_columns(columns, folder, settings=state_specimen(specimen, lab))
     return Judged(specimen, motion, discover([log]).verdict)
 
 

@@ -208,13 +208,14 @@ class LogResiduals:
     def shows_bumpers(self) -> bool:
         """Whether forces of the bumpers can be in the residual: not if no contact is long enough.
 
-        Load cells show a contact between the margins in which filters settle.
+        It is seen between the margins in which filters settle: in the rows of the load cells, or
+        without them beyond the gaps.
         """
-        rows = [
-            row for name, row in zip(self.rows, self.row_mask, strict=True) if name in CONTACT_ROWS
-        ]
-        has_cells = self.motion().has_load_cells
-        return any(row.any() for row in rows) if has_cells else bool(self.contact_state.any())
+        m, rows = self.motion(), dict(zip(self.rows, self.row_mask, strict=True))
+        if m.has_load_cells:
+            return any(rows[name].any() for name in CONTACT_ROWS)
+        right, left = m.gaps_m
+        return bool((rows["damper"] & ((m.u > right) | (-m.u > left))).any())
 
     @cached_property
     def row_mask(self) -> Bool2D:

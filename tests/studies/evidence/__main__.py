@@ -25,7 +25,7 @@ from tests.studies.evidence.laboratory import (
     record_component,
     vary,
 )
-from tests.studies.evidence.worlds import draw_world
+from tests.studies.evidence.worlds import draw_world, state_specimen
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ def play(case: Case) -> dict[str, object]:
             "place": case.place,
         }  # fmt: skip
         try:
-            stated = None if profile or case.component else s.mass
+            stated = {} if profile or case.component else state_specimen(s, case.lab)
             log = import_columns(columns, folder, profile, stated)
             start = time.process_time()
             result = discover([log])

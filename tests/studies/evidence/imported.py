@@ -24,13 +24,15 @@ def format_profile(specimen: Specimen, test: StepTest) -> str:
 
 
 def import_columns(
-    columns: Mapping[str, Float1D], folder: Path, profile: str = "", mass_kg: float | None = None
+    columns: Mapping[str, Float1D],
+    folder: Path,
+    profile: str = "",
+    settings: Mapping[str, float] | None = None,
 ) -> Path:
     """Write the columns of a recording to a folder, import them, and return the log."""
     table, log = write_table(columns, folder / "log.csv"), folder / "log.mcap"
     path = folder / "lab.toml" if profile else None
     if path is not None:
         path.write_text(profile)
-    settings = {} if mass_kg is None else {"mass_kg": mass_kg}
-    import_table(table, log, ImportOptions(profile=path, accept=True, settings=settings))
+    import_table(table, log, ImportOptions(profile=path, accept=True, settings=settings or {}))
     return log

@@ -1,7 +1,8 @@
 """Laboratories of any size: specimens, tables, motions and instruments drawn at random.
 
 A mass of 3 kg to 5 t on 0.7 to 7 Hz, with bumpers or without, under a logarithmic sweep, random
-motion, an earthquake or bursts of sines. No gap and no model is stated, as in a stranger's file.
+motion, an earthquake or bursts of sines. No model is stated, as in a stranger's file, and no gap
+where there are load cells.
 """
 
 from collections.abc import Mapping
@@ -12,7 +13,8 @@ import numpy as np
 from tests.studies.evidence.laboratory import FINE_HZ, Float1D, Instruments, Specimen
 
 RATES_HZ = (200.0, 250.0, 320.0, 500.0, 640.0, 1000.0, 1600.0, 2000.0)
-MISSING: tuple[tuple[str, ...], ...] = ((), (), ("mass_acc_m_s2",), ("table_acc_m_s2",), ())
+CELLS = ("force_r1_n", "force_r2_n", "force_l1_n", "force_l2_n")
+MISSING: tuple[tuple[str, ...], ...] = ((), (), ("mass_acc_m_s2",), ("table_acc_m_s2",), CELLS)
 BURSTS = (0.5, 0.7, 0.85, 1.0, 1.15, 1.4, 1.8)  # over the natural frequency
 
 
@@ -132,3 +134,9 @@ def draw_world(
     kind = ("sweep", "random", "quake", "bursts")[seed % 4]
     seconds = min(max(60 / natural_hz, 20), 90)
     return specimen, lab, Motion(kind, natural_hz, acc, rate_hz, seed, seconds), name, hidden
+
+
+def state_specimen(specimen: Specimen, lab: Instruments) -> dict[str, float]:
+    """Return what an import is told: the mass, and the gap where no load cell shows it."""
+    is_shown = not {*CELLS} & {*lab.missing} or not np.isfinite(specimen.gap_mm)
+    return {"mass_kg": specimen.mass} | ({} if is_shown else {"gap_mm": float(specimen.gap_mm)})
