@@ -73,6 +73,11 @@ def test_range_without_phase_resonance_is_refused_with_where_it_is(period_map, r
     assert "degrees" in str(caught.value)
 
 
+def test_range_far_above_the_lower_fold_has_its_phase_resonance(period_map) -> None:
+    orbit = find_phase_resonance(period_map(0.05 * GRAVITY_M_S2), (3.9, 4.1))
+    assert orbit.frequency_hz == pytest.approx(4.001, abs=1e-3)
+
+
 def test_table_under_external_control_is_refused() -> None:
     with raises_input_error(key="backend", value="follow"):
         read_run_config(PROFILES_DIR / "tests" / "g4_backbone.toml", "follow_simulated")

@@ -1,6 +1,7 @@
 """Orbit plan: points along the unstable branch of G4, their gains, and refusals."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -61,6 +62,24 @@ def test_range_that_begins_between_the_folds_is_reached_from_below_the_lower_one
     assert unstable_hz == sorted(unstable_hz)
     assert unstable_hz[0] < 2.83
     assert sum(f >= start_hz for f in unstable_hz) >= 7
+
+
+def test_a_range_far_below_the_upper_fold_is_planned() -> None:
+    """From rest 1.2 times above it, the model settles below its resonance: no fold lies there."""
+    plan = make_orbit_plan(Model(snm()), (2.75, 2.9), AG, 8, FEEDBACK_TIMING)
+    unstable_hz = [point.frequency_hz for point in plan.points if not point.stable]
+    assert [point.stable for point in plan.points[:4]] == [True, True, True, False]
+    assert unstable_hz == sorted(unstable_hz)
+    assert 2.787 < unstable_hz[0] < 2.8
+    assert 2.88 < unstable_hz[-1] < 2.9
+
+
+def test_a_range_below_the_folds_is_refused_with_the_whole_of_both_unstable_parts() -> None:
+    with raises_input_error(key="excitation.start_hz") as error:
+        make_orbit_plan(Model(snm()), (2.6, 2.7), AG, 8, FEEDBACK_TIMING)
+    _, lower_end, *upper = (float(word) for word in re.findall(r"[0-9.]+", error.value.allowed))
+    assert 1.73 < lower_end < 1.7366
+    assert upper == pytest.approx([2.787, 4.027], rel=1e-3)
 
 
 def test_a_coarse_plan_has_no_orbit_far_from_the_next() -> None:

@@ -31,7 +31,8 @@ from twin.model.model import Model
 from twin.setup.feedback_gains import FeedbackTiming, interpolate_gains
 
 RANGE_MARGIN = 1.2  # ratio of frequencies by which the branch is followed beyond the range
-REFUSAL_MARGIN = 1.6  # the same, to tell where unstable orbits are
+REFUSAL_MARGIN = 1.6  # the same below the range, to tell where unstable orbits are
+MAX_RAISES = 12  # by RANGE_MARGIN each, of the frequency above the range and all folds
 LEAD_ORBITS = 3  # stable ones before and after the unstable ones
 # Of the unstable part, largest distance of orbits from one to the next: the feedback, whose command
 # is limited, must hold each of them with what is known from the one before.
@@ -54,6 +55,12 @@ class UnstableStretch:
 
     orbits: tuple[Orbit, ...]
     positions: Float1D
+
+    @property
+    def unstable_hz(self) -> Float1D:
+        """Frequencies of the orbits of the unstable part, (orbit,)."""
+        inside = (self.positions >= 0.0) & (self.positions <= 1.0)
+        return np.array([orbit.frequency_hz for orbit in self.orbits])[inside]
 
     def divide(self, range_hz: tuple[float, float], points: int) -> list[float]:
         """Return positions of unstable orbits in a range, evenly spaced, and of stable ones.
@@ -146,30 +153,18 @@ def _plan_orbit(orbit: Orbit, gains: tuple[float, float]) -> PlannedOrbit:
 def find_unstable_stretch(period_map: PeriodMap, range_hz: tuple[float, float]) -> UnstableStretch:
     """Return the longest unstable part between folds in a frequency range, with its surroundings.
 
-    The branch is that of the orbit to which rest settles above the range, followed until it holds
-    the lower fold, below which rest leads to it. InputError without one.
+    The branch is that of `_follow_from_above`, followed until it holds the lower fold, below which
+    rest leads to it. InputError without one.
     """
-    high_hz = range_hz[1] * RANGE_MARGIN
-    start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
-    if start is None:
-        raise InputError(
-            f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz",
-            key="excitation.stop_hz",
-            value=range_hz[1],
-            remedy="choose another range",
-        )
     for margin in (RANGE_MARGIN, REFUSAL_MARGIN):
-        branch = continue_branch(start, FREQUENCY, (range_hz[0] / margin, high_hz))
+        branch = _follow_from_above(period_map, range_hz, margin)
         stretches = [
             stretch
             for stretch in _split_unstable(branch)
-            if any(
-                not orbit.stable and range_hz[0] <= orbit.frequency_hz <= range_hz[1]
-                for orbit in stretch.orbits
-            )
+            if ((stretch.unstable_hz >= range_hz[0]) & (stretch.unstable_hz <= range_hz[1])).any()
         ]
         if stretches:
-            longest = max(stretches, key=lambda stretch: sum(not o.stable for o in stretch.orbits))
+            longest = max(stretches, key=lambda stretch: stretch.unstable_hz.size)
             if longest.positions[0] < 0.0:
                 return longest
     if not stretches:
@@ -183,6 +178,37 @@ def find_unstable_stretch(period_map: PeriodMap, range_hz: tuple[float, float]) 
     )
 
 
+def _follow_from_above(
+    period_map: PeriodMap, range_hz: tuple[float, float], margin: float
+) -> Branch:
+    """Return the branch of the orbit to which rest settles above a range, from `margin` below it.
+
+    Where folds lie above the range, rest may settle below its resonance, or the branch turns back
+    to where it began: it is followed from higher up, so that it holds them. InputError where rest
+    settles to no orbit of period 1.
+    """
+    branch: Branch | None = None
+    for raises in range(1, MAX_RAISES + 1):
+        high_hz = range_hz[1] * RANGE_MARGIN**raises
+        start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
+        if start is None:
+            continue
+        is_above = measure_orbit_phase(start) < RESONANCE_PHASE_DEG
+        if is_above or branch is None:
+            branch = continue_branch(start, FREQUENCY, (range_hz[0] / margin, high_hz))
+            if is_above and not all(math.isclose(end.value, high_hz) for end in branch.ends):
+                break
+    if branch is None:
+        raise InputError(
+            f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz and "
+            f"{period_map.acceleration_m_s2 / GRAVITY_M_S2:.4g} g, nor above the range before",
+            key="excitation.stop_hz",
+            value=range_hz[1],
+            remedy="choose another range",
+        )
+    return branch
+
+
 def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
     """Return the error that the range has no unstable orbit, with what the branch has."""
     inside = [
@@ -190,19 +216,17 @@ def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
         for point in branch.points
         if range_hz[0] <= point.value <= range_hz[1]
     ]
-    others = [
-        orbit.frequency_hz
-        for stretch in _split_unstable(branch)
-        for orbit in stretch.orbits
-        if not orbit.stable
-    ]
+    extents = sorted(
+        (own.min(), own.max()) for own in (s.unstable_hz for s in _split_unstable(branch))
+    )
+    others = " or ".join(f"{low:.4g} to {high:.4g}" for low, high in extents)
     largest = f" (largest multiplier {max(inside):.4g})" if inside else ""
     return InputError(
         f"the model has no unstable orbit between folds from {range_hz[0]:g} to {range_hz[1]:g} "
         f"Hz{largest}",
         key="excitation.start_hz",
         value=range_hz[0],
-        allowed=f"a range within {min(others):.4g} to {max(others):.4g} Hz" if others else "",
+        allowed=f"a range within {others} Hz" if others else "",
         remedy="choose another range, level or model",
     )
 
@@ -360,6 +384,7 @@ def _find_replace_after(profile: Profile, rig: RigConfig) -> int:
     return open_backend(rig, profile, ManualClock()).replace_after
 
 
+RESONANCE_PHASE_DEG = 90.0  # by which u leads: more below the resonance, less above
 PHASE_TOLERANCE_DEG = 1e-3
 MAX_BISECTIONS = 40
 LEAD_RATIO = 1.04  # of the frequencies of two orbits on the way from rest to the resonance
@@ -368,8 +393,8 @@ LEAD_RATIO = 1.04  # of the frequencies of two orbits on the way from rest to th
 def find_phase_resonance(period_map: PeriodMap, range_hz: tuple[float, float]) -> Orbit:
     """Return the largest orbit in phase resonance within a frequency range, at one level.
 
-    The branch is that of the orbit to which rest settles above the range. InputError without one,
-    with the phases of the branch in the range.
+    The branch is that of `_follow_from_above`. InputError without one, with the phases of the
+    branch in the range.
     """
     return find_resonance_approach(period_map, range_hz)[-1]
 
@@ -380,29 +405,22 @@ def find_resonance_approach(period_map: PeriodMap, range_hz: tuple[float, float]
     From rest the first is reached without any other solution to fall to; where the branch has no
     fold the resonance alone is returned. InputError as in `find_phase_resonance`.
     """
-    high_hz = range_hz[1] * RANGE_MARGIN
-    start = settle_to_orbit(period_map.with_parameter(FREQUENCY, high_hz))
     level_g = period_map.acceleration_m_s2 / GRAVITY_M_S2
-    if start is None:
-        raise InputError(
-            f"from rest, the model does not settle to an orbit of period 1 at {high_hz:.4g} Hz and "
-            f"{level_g:.4g} g",
-            key="excitation.stop_hz",
-            value=range_hz[1],
-            remedy="choose another range",
-        )
-    branch = continue_branch(start, FREQUENCY, (range_hz[0] / RANGE_MARGIN, high_hz))
-    orbits = [point.orbit for point in branch.points]
-    phases = np.array([measure_orbit_phase(orbit) for orbit in orbits])
-    is_crossing = np.diff(np.sign(phases - 90.0)) != 0.0
-    resonances = {
-        int(k): _locate(orbits[k], orbits[k + 1], float(phases[k]))
-        for k in np.flatnonzero(is_crossing)
-    }
-    inside = [
-        k for k, orbit in resonances.items() if range_hz[0] <= orbit.frequency_hz <= range_hz[1]
-    ]
-    if not inside:
+    for margin in (RANGE_MARGIN, REFUSAL_MARGIN):
+        branch = _follow_from_above(period_map, range_hz, margin)
+        orbits = [point.orbit for point in branch.points]
+        phases = np.array([measure_orbit_phase(orbit) for orbit in orbits])
+        is_crossing = np.diff(np.sign(phases - RESONANCE_PHASE_DEG)) != 0.0
+        resonances = {
+            int(k): _locate(orbits[k], orbits[k + 1], float(phases[k]))
+            for k in np.flatnonzero(is_crossing)
+        }
+        inside = [
+            k for k, orbit in resonances.items() if range_hz[0] <= orbit.frequency_hz <= range_hz[1]
+        ]
+        if inside:
+            break
+    else:
         raise _make_phase_error(branch.values, phases, range_hz, level_g, [*resonances.values()])
     k = max(inside, key=lambda k: resonances[k].u_max - resonances[k].u_min)
     # The branch comes from higher frequencies: the way up to the resonance lies on the other side.
@@ -451,9 +469,9 @@ def _locate(first: Orbit, second: Orbit, first_phase: float) -> Orbit:
             return first if middle < 0.5 else second
         orbit = problem.make_orbit(point.z, point.linearization.result)
         phase = measure_orbit_phase(orbit)
-        if abs(phase - 90.0) < PHASE_TOLERANCE_DEG:
+        if abs(phase - RESONANCE_PHASE_DEG) < PHASE_TOLERANCE_DEG:
             break
-        if (phase > 90.0) == (first_phase > 90.0):
+        if (phase > RESONANCE_PHASE_DEG) == (first_phase > RESONANCE_PHASE_DEG):
             low = middle
         else:
             high = middle
