@@ -2,7 +2,8 @@
 
     python -m tests.studies.ready_tests --count 200 --seed 1
 
-Profiles, records and rigs are drawn at random. A refusal after motion is printed with its reason.
+Profiles, records and rigs are drawn at random. A line is printed for each ready test: how it ended,
+of a refusal after motion with its reason.
 """
 
 import argparse
@@ -133,8 +134,7 @@ def main() -> None:
                 continue
             verdict, reason = play_loop_check(config)
             ends[verdict] += 1
-            if verdict != "begun":
-                print(f"{sum(ends.values())} {kind}: {verdict}, {reason}", flush=True)
+            print(f"{sum(ends.values())} {kind}: {verdict} {reason}", flush=True)
             if sum(ends.values()) - ends["not ready"] >= options.count:
                 break
     print(dict(ends))

@@ -1,7 +1,7 @@
 """Faults while the feedback holds an orbit: trip, underrun, late or lost samples, a dead rig."""
 
 import math
-from itertools import islice
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -114,7 +114,7 @@ def test_silent_machine_halts_the_test() -> None:
 
 @pytest.mark.slow  # 5 s
 def test_queue_of_a_dead_rig_ends_at_rest() -> None:
-    """At every tenth block, from the capture to the releases at the first orbit."""
+    """At every tenth block, from the capture to the end of the releases at the first orbit."""
     profile, clock = make_profile(slice(1)), ManualClock()
     backend = open_backend(RIG, profile, clock)
     assert isinstance(backend, SimulatedBackend)
@@ -123,14 +123,14 @@ def test_queue_of_a_dead_rig_ends_at_rest() -> None:
     blocks = (item for item in session if isinstance(item, Block))
     played: list[Float1D] = []
     checked = 0
-    for block in islice(blocks, round(56.0 * RATE_HZ / 20)):
+    for block in takewhile(lambda b: b.end < CAPTURE_S * RATE_HZ or b.step[-1] == 0, blocks):
         played.append(block.channel("drive_disp_m"))
         if len(played) % 10 == 0 and block.end > CAPTURE_S * RATE_HZ:
             left = backend._command_between(block.end, block.end + round(3.0 * RATE_HZ))
             recent = np.concatenate([*played[-50:], left])
             assert_rests_smoothly(recent, (recent.size - left.size) / RATE_HZ)
             checked += 1
-    assert checked > 400
+    assert checked > 300
     session.close()
     assert math.isclose(float(backend._command[-1]), 0.0, abs_tol=NO_COMMAND_M)
 
