@@ -331,6 +331,8 @@ def evaluate_force(u: Float1D, rate_hz: float, model: dict[str, Any], slip_speed
                 force = force + p["k3"] * u**3
             case "quadratic_damping":
                 force = force + p["c2"] * v * np.abs(v)
+            case "position_damping":
+                force = force + p["cu"] * u**2 * v
             case "coulomb_friction":
                 force = force + p["fc"] * np.tanh(v / slip_speed)
             case "stribeck_friction":
