@@ -1,5 +1,6 @@
 """A table of samples becomes a log: what our own run says of itself comes out of its CSV again."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -222,7 +223,7 @@ def test_import_table_without_a_profile_warns_and_has_its_curve(
     sweep = read_recorded_config(bare).profile.sweep
     assert (sweep.cycles, sweep.measured_cycles) == (6, 2)
     (warning,) = (event for event in bare.records(Event) if event.kind == "warning")
-    assert warning.text.startswith("no --profile: unit mass, no bumpers, a placeholder model")
+    assert warning.text.startswith("no --profile: unit mass, no gap stated, a placeholder model")
     assert f"warning: {warning.text}" in imported.notes
     bare_size = len(whole(bare))
     assert (imported.gaps, imported.samples, imported.channels) == (
@@ -246,6 +247,24 @@ def test_mass_and_gap_are_stated_without_a_profile_or_in_it(
             tmp_path / "out.csv", tmp_path / "both.mcap",
             replace(stated, settings={"gap_mm": 3.0}, profile=run[0] / "quick.toml"),
         )  # fmt: skip
+
+
+@pytest.mark.parametrize(("key", "value"), [("gap_mm", math.nan), ("mass_kg", -5.0)])
+def test_an_impossible_specimen_is_one_clear_error(
+    key: str, value: float, run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    options = ImportOptions(settings={key: value}, accept=True)
+    with raises_input_error(key=key):
+        import_table(run[0] / "table.csv", tmp_path / "l.mcap", options)
+
+
+def test_a_file_that_states_its_specimen_takes_no_other(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    export_log(ExportOptions(run[1].path, ("parquet",), tmp_path / "out"))
+    options = ImportOptions(settings={"gap_mm": 4.0}, accept=True)
+    with raises_input_error(key="gap_mm", value=4.0, problem="states the gap"):
+        import_table(tmp_path / "out.parquet", tmp_path / "l.mcap", options)
 
 
 def test_a_file_too_slow_for_a_model_is_referred_to_another_model(

@@ -72,7 +72,7 @@ def import_command(
     ] = None,
     gap: Annotated[
         float | None,
-        typer.Option("--gap", metavar="MM", help="Gap of the bumpers, without a profile."),
+        typer.Option("--gap", metavar="MM", help="Gap, right plus left, without a profile."),
     ] = None,
     rate: Annotated[
         float | None,

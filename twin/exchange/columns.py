@@ -4,6 +4,7 @@ Units are declared, never inferred. Numbers that are absurd in a unit which nobo
 refused; in a stated unit they cause a warning.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -19,7 +20,7 @@ from table_io.channels import (
     TIME_COLUMN,
     Channel,
 )
-from table_io.config.base import ConfigModel, Finite, Positive
+from table_io.config.base import ConfigModel, Finite, Number, Positive
 from table_io.errors import InputError, suggest
 from table_io.formats import MAX_LISTED_COLUMNS
 from table_io.formats.table import ForeignTable
@@ -90,7 +91,9 @@ class ColumnMap(ConfigModel):
     group: str = Field("", description="Group, structure or folder inside the file.")
     rate_hz: Positive | None = Field(None, description="Sampling rate of a file without times.")
     mass_kg: Positive | None = Field(None, description="Moving mass; a component test has none.")
-    gap_mm: Finite | None = Field(None, description="Gap of the bumpers; none without bumpers.")
+    gap_mm: Number | None = Field(
+        None, gt=-math.inf, description="Gap, right plus left; inf = no bumpers."
+    )
     from_s: Finite | None = Field(None, description="First time of the file that is imported.")
     to_s: Finite | None = Field(None, description="Last time of the file that is imported.")
     rest: bool | None = Field(

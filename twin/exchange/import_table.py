@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from table_io.block import Block, Float1D, Float2D, Int1D, Label, find_stretches
-from table_io.config.base import load_config, parse_toml
+from table_io.config.base import format_toml, load_config, parse_toml
 from table_io.config.channel import declare_table_channels, read_channels
 from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import Profile, load_profile
@@ -133,8 +133,10 @@ class ImportOptions:
         """Return the map with the settings; None if there is nothing to state."""
         if not self.settings:
             return column_map
-        stated = column_map.model_dump(exclude_unset=True) if column_map is not None else {}
-        return ColumnMap.model_validate(stated | dict(self.settings))
+        stated = {}
+        if column_map is not None:
+            stated = column_map.model_dump(exclude_unset=True, exclude_none=True)
+        return parse_toml(format_toml(stated | dict(self.settings)), ColumnMap, "options")
 
 
 @dataclass(frozen=True)
@@ -148,10 +150,18 @@ class _StatedSpecimen:
     def from_map(cls, column_map: ColumnMap | None) -> "_StatedSpecimen":
         return cls() if column_map is None else cls(column_map.mass_kg, column_map.gap_mm)
 
+    def refuse_beside(self, place: str, stated: Mapping[str, Any]) -> None:
+        """Raise InputError if mass or gap are among what is stated beside a profile."""
+        for key, value in asdict(self).items():
+            if value is not None and stated.get(key) is not None:
+                problem = f"{place} states the {key.split('_')[0]}"
+                raise InputError(problem, key=key, value=value, remedy="leave one out")
+
     def describe(self) -> dict[str, str]:
         """Return the words for mass and bumpers."""
         mass = "unit mass" if self.mass_kg is None else f"{self.mass_kg:g} kg"
-        bumpers = "no bumpers" if self.gap_mm is None else f"a gap of {self.gap_mm:g} mm"
+        bumpers = "no gap stated" if self.gap_mm is None else f"a gap of {self.gap_mm:g} mm"
+        bumpers = "no bumpers" if self.gap_mm == math.inf else bumpers
         return {"mass": mass, "bumpers": bumpers}
 
 
@@ -178,8 +188,9 @@ def import_table(
     if out.suffix != ".mcap":
         raise InputError("not the name of a log", where=out, allowed="names that end in .mcap")
     column_map = options.read_map()
+    options.apply_settings(None)  # report errors before reading a long table
     if options.profile is not None:
-        load_profile(options.profile)  # report errors before reading a long table
+        load_profile(options.profile)
     table = read_table(file, column_map.group if column_map is not None else "")
     rig_toml = _read_rig_toml(table, options)
     known = ImportColumns(read_channels(rig_toml))
@@ -255,6 +266,7 @@ def import_data(
 
 def propose_import(file: Path, options: ImportOptions) -> MapProposal:
     """Return the proposed map of the columns of a file; what its samples leave open is asked."""
+    options.apply_settings(None)
     if options.profile is not None:
         load_profile(options.profile)
     table = read_table(file)
@@ -376,19 +388,13 @@ def _build_run_config(
     if profile is None and _has_config_texts(table):
         profile_toml, model_toml = table.texts["profile_toml"], table.texts["model_toml"]
         file_profile = parse_toml(profile_toml, Profile, f"profile in {file}")
+        specimen.refuse_beside("the profile in the file", options.settings)
         if file_profile.acquisition.rate_hz != rate_hz:
             profile_toml = _set_rate(profile_toml, rate_hz)
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
     if profile is None:
         return _build_placeholder(table, rig_toml, rate_hz, labels, specimen)
-    for key, value in asdict(specimen).items():
-        if value is not None:
-            raise InputError(
-                f"the profile states the {key.split('_')[0]}",
-                key=key,
-                value=value,
-                remedy="leave one out",
-            )
+    specimen.refuse_beside("the profile", asdict(specimen))
     test_profile, text = load_profile(profile)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
