@@ -337,15 +337,20 @@ def test_a_named_effect_is_described_with_equation_and_source() -> None:
         estimate_half_widths=lambda: {"backlash_m": 1e-6},
         parameters=BASIC._replace(backlash_m=5e-5),
     )
-    best: Any = SimpleNamespace(effects=(EFFECT_BY_ID["backlash"],), fit=fit, gap=0.05)
-    verdict = SelectionVerdict("named", best, 0.99, 0.99, (), False, "", "")
-    without: Any = SimpleNamespace(gap=0.1)
+    best: Any = SimpleNamespace(
+        effects=(EFFECT_BY_ID["backlash"],), names=("backlash",), fit=fit, gap=0.05
+    )
+    verdict = SelectionVerdict("named", best, 0.99, 0.99, (), False, "the residual is noise", "")
+    without: Any = SimpleNamespace(effects=(), fit=fit, gap=0.1)
     discovery: Any = SimpleNamespace(verdict=verdict, basic=without, fitted=best)
     lines = describe_discovery(discovery)
-    assert lines[0] == "missing effects: named, with a probability of 0.99"
+    assert lines[0] == ("missing effects: named, with a probability of 0.99: the residual is noise")
     assert lines[2].startswith("  equation: f -> f - K b/2 sat(2 f / (K b)) (Nordin, Gutman")
     assert lines[3].startswith("  backlash_m = 5e-05 +- 1e-06 m (95 %)")
     assert lines[4] == "  left on held-out data: 10 % -> 5 % of the motion"
+    refused: Any = SimpleNamespace(verdict=verdict, basic=without, fitted=without)
+    (note,) = [line for line in describe_discovery(refused) if "not kept" in line]
+    assert note.endswith("backlash")
 
 
 @pytest.mark.slow  # 60 s each

@@ -319,7 +319,14 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
     verdict = discovery.verdict
     fitted, without = discovery.fitted, discovery.basic
     widths, parameters = fitted.fit.estimate_half_widths(), fitted.fit.parameters
-    lines = [f"missing effects: {verdict.outcome}, with a probability of {verdict.confidence:.3g}"]
+    lines = [
+        f"missing effects: {verdict.outcome}, with a probability of {verdict.confidence:.3g}: "
+        f"{verdict.reason}"
+    ]
+    kept = {effect.id for effect in fitted.effects}
+    if dropped := [name for name in verdict.best.names if name not in kept]:
+        names = " and ".join(name.replace("_", " ") for name in dropped)
+        lines.append(f"  not kept in the twin, which predicts better without: {names}")
     if verdict.place:
         lines.append(f"  what no effect explains lies in: {verdict.place}")
     for effect in fitted.effects:
