@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from table_io.block import Block, join_blocks
+from table_io.block import Block, Label, join_blocks
 from table_io.errors import InputError
 from tests.discovery.played import TRUE, blocks, format_truth, log
 from twin.discovery.signals import build_signals
@@ -185,3 +185,24 @@ def test_along_a_motion_the_forces_are_those_of_the_law() -> None:
     np.testing.assert_allclose(right, np.where(u > 0.002, push, 0.0), rtol=1e-12, atol=1e-9)
     pull = 510e3 * (u + 0.002) + 900.0 * v
     np.testing.assert_allclose(left, np.where(u < -0.002, pull, 0.0), rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.5])
+def test_a_record_cut_out_of_a_motion_has_the_motion_of_its_sensors(offset: float) -> None:
+    """Up to its ends, also with an accelerometer off zero: offsets are taken off the spectra."""
+    rate_hz, size = 1000.0, 12_000
+    t, w = np.arange(size) / rate_hz, 2 * np.pi * np.array([0.7, 1.3])
+    u = 0.01 * np.sin(w[0] * t + 1.0) + 0.02 * np.sin(w[1] * t + 2.0)
+    acc = -0.01 * w[0] ** 2 * np.sin(w[0] * t + 1.0) - 0.02 * w[1] ** 2 * np.sin(w[1] * t + 2.0)
+    rng = np.random.default_rng(0)
+    noise = rng.standard_normal((4, size)) * np.array([[1e-4], [1e-4], [0.01], [0.01]])
+    values = np.array([u, np.zeros(size), acc + offset, np.zeros(size)]) + noise
+    names = ("mass_disp_m", "table_disp_m", "mass_acc_m_s2", "table_acc_m_s2")
+    outside = np.full(size, -1)
+    label = np.full(size, int(Label.SETTLE))
+    block = Block("meas", 0, rate_hz, names, values, outside, label, outside)
+    signals = build_signals((block,), "cut", 550.0, (np.inf, np.inf))
+    motion = signals.fuse_motion([SensorModel("mass_acc_m_s2", offset=offset)])
+    error = (motion.u - u[:: signals.grid.decimation])[motion.good]
+    # as loud at the ends as in the middle
+    assert np.abs(error).max() < 6.0 * error[error.size // 3 : 2 * error.size // 3].std()

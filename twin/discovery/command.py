@@ -314,13 +314,13 @@ def print_identification(report: IdentificationReport) -> None:
     for log, gap in report.gaps.items():
         if gap.interval:
             half = gap.interval.half_width
-            difference = gap.interval.value - gap.stated
+            difference = gap.interval.value - gap.stated if gap.stated is not None else 0.0
             table.add_row(
                 f"gap of {log}",
                 *_format_interval(gap.interval, 1e3),
                 "mm",
-                f"{1e3 * gap.stated:g}",
-                f"{INTERVAL_SIGMA * difference / half:+.1f}" if half else "",
+                "not stated" if gap.stated is None else f"{1e3 * gap.stated:g}",
+                f"{INTERVAL_SIGMA * difference / half:+.1f}" if half and difference else "",
             )
     print_table(console, table)
     _print_subsets(report)

@@ -208,7 +208,7 @@ def list_fit_warnings(
     else:
         for residuals in log_residuals:
             if GapKey(residuals.log_number) not in joint.values:
-                yield f"{residuals.signals.name}: touches no bumper; its gap is the stated one"
+                yield f"{residuals.signals.name}: touches no bumper; its gap is kept as given"
     for key in fixed:
         yield f"{key}: not determined by the logs; kept as in the start model"
 

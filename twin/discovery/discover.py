@@ -149,8 +149,7 @@ def prepare_problem(
         if not residuals.knows_noise
     ]
     notes += [
-        f"{residuals.signals.name}: no contact lasts longer than its filters settle; the bumpers "
-        "are not judged"
+        f"{residuals.signals.name}: {_say_hidden(residuals)}; the bumpers are not judged"
         for residuals in log_residuals
         if residuals.contact_state.any() and not residuals.shows_bumpers
     ]
@@ -158,6 +157,16 @@ def prepare_problem(
     library, excluded = list_candidates(log_residuals, parameters, without)
     return PreparedProblem(
         SelectionProblem(log_residuals, library, mapper), first, excluded, tuple(notes)
+    )
+
+
+def _say_hidden(residuals: LogResiduals) -> str:
+    """Return why no sample shows a bumper that is or may be touched."""
+    if residuals.motion().has_load_cells:
+        return "no contact lasts longer than its filters settle"
+    return (
+        "no load cell shows contact, and the motion hardly exceeds the stated gap; if the gap is "
+        "less, state it"
     )
 
 

@@ -23,7 +23,7 @@ from twin.discovery.signals import (
     has_single_frequency,
     is_channel_alive,
 )
-from twin.discovery.starting_values import state_measured_gaps
+from twin.discovery.starting_values import measure_gaps
 from twin.recording.reader import Recording
 from twin.recording.run_paths import resolve_log_path
 from twin.results.recordings import open_recording
@@ -92,17 +92,29 @@ def load_recording(recording: Recording, name: str) -> LoadedLog:
         )
     is_stated = "contact_n" in profile.comparison.model_fields_set
     contact_n = profile.comparison.contact_n if is_stated else 0.0  # else from the record
-    signals, sides = state_measured_gaps(signals, contact_n)
+    signals = measure_gaps(signals, contact_n)
     log = PreparedLog(signals, contact_n, start.steps)
-    notes = [*_list_notes(recording, profile, signals, recorded, blocks, dead)]
-    if sides:
-        gaps = " and ".join(f"{1e3 * gap:.4g} mm" for gap in signals.gaps_m if math.isfinite(gap))
-        notes.append(
-            f"{name}: the gap is not stated; the load cells of the {' and '.join(sides)} show "
-            f"{gaps} from the middle"
-        )
+    notes = [
+        *_list_notes(recording, profile, signals, recorded, blocks, dead),
+        *_list_gap_notes(signals),
+    ]
     clipping = _list_clipping_notes(name, clipped, recorded, blocks)
     return LoadedLog(log, blocks, (*(f"{name}: {line}" for line in findings), *notes, *clipping))
+
+
+def _list_gap_notes(signals: LogSignals) -> Iterator[str]:
+    """Yield notes on gaps that load cells show, where none is stated."""
+    gaps = dict(zip(("right", "left"), signals.gaps_m, strict=True))
+    if sides := signals.measured_sides:
+        shown = " and ".join(f"{1e3 * gaps[side]:.4g} mm {side}" for side in sides)
+        total = f", together {1e3 * sum(gaps.values()):.4g} mm" if len(sides) == len(gaps) else ""
+        yield f"{signals.name}: the gap is not stated; the load cells show {shown}{total}"
+    for side, cells in (("right", RIGHT_CELLS), ("left", LEFT_CELLS)):
+        if sides and math.isinf(gaps[side]) and not {*cells} & {*signals.channels}:
+            yield (
+                f"{signals.name}: no load cell measures the {side} side: if there is a bumper, "
+                "state the gap, and the balance of the mass gives the sum of both"
+            )
 
 
 def _discard_samples(block: Block, gaps: Sequence[SampleGap]) -> Block:

@@ -341,7 +341,9 @@ class EstimatedParameter(Interval):
 class IdentifiedGap(Contract):
     """Total gap of a log: stated, and of each side; with its interval where contacts tell."""
 
-    stated: Real = Field(description="in the test profile, in `unit`")
+    stated: Real | None = Field(
+        description="in the test profile, in `unit`; null where load cells show it"
+    )
     unit: str = Field(description="unit of the numbers")
     right: Real = Field(description="gap of the right side, in `unit`")
     left: Real = Field(description="gap of the left side, in `unit`")

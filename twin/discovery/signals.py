@@ -35,6 +35,7 @@ from twin.model.model import SensorModel
 LOST_MARGIN_S = 0.3  # excluded around lost samples: the fusion spreads the interpolation error
 FILL_ROUNDS = 20  # in which lost samples of a sensor approach what the other one of its body tells
 OPEN_END_S = 0.5  # excluded at each end of the record
+MIN_END_SAMPLES = 10  # from which an end of a record is continued
 # Of the power of a drive with a single frequency: within this width, of the frequency, about it.
 MIN_SINGLE_LINE_SHARE, SINGLE_LINE_WIDTH = 0.95, 0.05
 # Power over that of the noise above which a band holds forces, and the share of the corner of a
@@ -90,6 +91,7 @@ class LogSignals:
     motion_pass: Float1D | float = 1.0  # gain of a Wiener filter of the displacement, (frequency,)
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
     hum_hz: tuple[float, ...] = ()  # lines of the mains that were removed
+    measured_sides: tuple[str, ...] = ()  # whose gaps load cells show, where none is stated
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -608,7 +610,8 @@ def _continue_motion(position: Float1D, acc: Float1D, rate_hz: float) -> tuple[F
     """Return displacement and acceleration of a motion that comes to rest after its record.
 
     A polynomial of fifth order, from the last position and velocity; these are those with which the
-    integrated acceleration follows the displacement at the end of the record.
+    integrated acceleration follows the displacement at the end of the record. What it is off by
+    there as a parabola is an offset of the accelerometer, no motion.
     """
     size = min(round(OPEN_END_S * rate_hz), position.size)
     time = (np.arange(size) - size + 1.0) / rate_hz
@@ -616,10 +619,11 @@ def _continue_motion(position: Float1D, acc: Float1D, rate_hz: float) -> tuple[F
     moved = cumulative_trapezoid(velocity, dx=1.0 / rate_hz, initial=0.0)
     rest = position[-size:] - moved
     used = np.isfinite(rest)
-    if used.sum() < 2:
+    if used.sum() < MIN_END_SAMPLES:
         return np.zeros(0), np.zeros(0)
-    slope, start = np.polyfit(time[used], rest[used], 1)
-    x, v, a = start + moved[-1], slope + velocity[-1], np.nan_to_num(acc[-1])
+    bend, slope, start = np.polyfit(time[used], rest[used], 2)
+    x, v = start + moved[-1], slope + velocity[-1]
+    a = np.nan_to_num(acc[-1]) + 2.0 * bend
     length = 0.5 * PAD_S
     s = np.arange(1, round(length * rate_hz)) / (length * rate_hz)
     # x(0), x'(0), x''(0) as given, and all of them 0 at s = 1

@@ -31,16 +31,14 @@ def choose_start(log_residuals: Sequence[LogResiduals], parameters: ParameterSet
     return read if costs[1] < costs[0] else parameters
 
 
-def state_measured_gaps(
-    signals: LogSignals, contact_n: float
-) -> tuple[LogSignals, tuple[str, ...]]:
+def measure_gaps(signals: LogSignals, contact_n: float) -> LogSignals:
     """Return the signals with the gaps that the load cells show where none is stated.
 
-    `contact_n` is a least contact threshold in N. Also return the sides whose gaps were measured.
+    `contact_n` is a least contact threshold in N.
     """
     m = signals.fuse_motion()
     if not m.has_load_cells:
-        return signals, ()
+        return signals
     contact = read_contact(signals, m, find_contact_thresholds(signals, m, contact_n))
     gaps, measured = list(m.gaps_m), []
     for side, stated in enumerate(m.gaps_m):
@@ -48,7 +46,7 @@ def state_measured_gaps(
         if math.isinf(stated) and fitted is not None and fitted[2] < float(np.nanmax(np.abs(m.u))):
             gaps[side] = fitted[2]
             measured.append(("right", "left")[side])
-    return replace(signals, gaps_m=(gaps[0], gaps[1])), tuple(measured)
+    return replace(signals, gaps_m=(gaps[0], gaps[1]), measured_sides=tuple(measured))
 
 
 def _read_start(log_residuals: Sequence[LogResiduals], parameters: ParameterSet) -> ParameterSet:

@@ -401,7 +401,9 @@ def _build_gap(result: IdentificationResult, log: int) -> IdentifiedGap:
     """Return the total gap of a log in m: stated, and with contact the fitted one."""
     residuals = result.problem.log_residuals[log]
     right, left = (fitted_gap(residuals, result.fit, side) for side in ("right", "left"))
-    gap = IdentifiedGap(stated=sum(residuals.signals.gaps_m), unit="m", right=right, left=left)
+    signals = residuals.signals
+    stated = None if signals.measured_sides else sum(signals.gaps_m)
+    gap = IdentifiedGap(stated=stated, unit="m", right=right, left=left)
     key = GapKey(log)
     if key in result.fit.std_errors:
         total = build_interval(right + left, 2 * result.fit.interval_error(key), "m")
