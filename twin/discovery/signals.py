@@ -621,16 +621,14 @@ def _continue_motion(position: Float1D, acc: Float1D, rate_hz: float) -> tuple[F
     used = np.isfinite(rest)
     if used.sum() < MIN_END_SAMPLES:
         return np.zeros(0), np.zeros(0)
-    bend, slope, start = np.polyfit(time[used], rest[used], 2)
+    _, slope, start = np.polyfit(time[used], rest[used], 2)
     x, v = start + moved[-1], slope + velocity[-1]
-    a = np.nan_to_num(acc[-1]) + 2.0 * bend
     length = 0.5 * PAD_S
     s = np.arange(1, round(length * rate_hz)) / (length * rate_hz)
-    # x(0), x'(0), x''(0) as given, and all of them 0 at s = 1
+    # x(0) and x'(0) as given; x''(0) = 0, for the last reading is mostly noise; and 0 at s = 1
     of_x = Polynomial([1.0, 0.0, 0.0, -10.0, 15.0, -6.0])
     of_v = Polynomial([0.0, 1.0, 0.0, -6.0, 8.0, -3.0])
-    of_a = Polynomial([0.0, 0.0, 0.5, -1.5, 1.5, -0.5])
-    motion = x * of_x + v * length * of_v + a * length**2 * of_a
+    motion = x * of_x + v * length * of_v
     return motion(s), motion.deriv(2)(s) / length**2
 
 
