@@ -158,9 +158,9 @@ def test_samples_beyond_the_range_of_a_sensor_are_not_used(plain: Made, tmp_path
 
 def test_bumpers_that_the_profile_does_not_know(tmp_path: Path) -> None:
     truth = "[base]\ngap_right_m = 0.002\ngap_left_m = 0.002\n"
-    _, notes = load_logs([record_run(tmp_path / "touching", truth, math.inf).log])
-    assert sum("no right bumper" in text for text in notes) == 2
-    assert sum("no left bumper" in text for text in notes) == 2
+    (log,), notes = load_logs([record_run(tmp_path / "touching", truth, math.inf).log])
+    assert log.signals.gaps_m == pytest.approx((0.002, 0.002), rel=0.05)
+    assert sum("the gap is not stated" in text for text in notes) == 1
 
 
 @pytest.mark.slow  # a minute: every law is tried
