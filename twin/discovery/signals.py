@@ -4,7 +4,7 @@ Gain, lag and offset of a sensor are simple operations on its spectrum, so a fit
 """
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -579,6 +579,15 @@ def build_signals(
     return replace(signals, motion_pass=gain) if is_whole else signals
 
 
+def _list_fused(columns: Container[str]) -> Iterator[tuple[str, Mapping[str, float]]]:
+    """Yield each laser that is fused with accelerometers, and the signs of these."""
+    has_lasers = "mass_disp_m" in columns and "table_disp_m" in columns
+    bodies = [(laser, {acc: 1.0}) for _, laser, acc in BODY_SENSORS]
+    for laser, signs in bodies if has_lasers else [("rel_disp_m", RELATIVE_SIGNS)]:
+        if all(name in columns for name in (laser, *signs)):
+            yield laser, signs
+
+
 def _continue_ends(
     columns: Mapping[str, Float1D], grid: FrequencyGrid
 ) -> dict[str, tuple[Float1D, Float1D]]:
@@ -588,12 +597,8 @@ def _continue_ends(
     ring in the fused motion for as long as its slowest frequency that is taken from the latter.
     Both are continued by the same smooth motion, from where they end.
     """
-    has_lasers = {"mass_disp_m", "table_disp_m"} <= columns.keys()
-    groups = [(laser, {acc: 1.0}) for _, laser, acc in BODY_SENSORS]
     ends: dict[str, tuple[Float1D, Float1D]] = {}
-    for laser, signs in groups if has_lasers else [("rel_disp_m", RELATIVE_SIGNS)]:
-        if not {laser, *signs} <= columns.keys():
-            continue
+    for laser, signs in _list_fused(columns):
         acc = np.sum([sign * columns[name] for name, sign in signs.items()], axis=0)
         after, back = (
             _continue_motion(columns[laser][::step], acc[::step], grid.rate_hz) for step in (1, -1)
@@ -642,11 +647,7 @@ def _fill_lost(
     displacement follows the accelerations but for what is slower than its longest lost stretch.
     """
     filled = dict(columns)
-    has_lasers = {"mass_disp_m", "table_disp_m"} <= columns.keys()
-    groups = [(laser, {acc: 1.0}) for _, laser, acc in BODY_SENSORS]
-    for laser, signs in groups if has_lasers else [("rel_disp_m", RELATIVE_SIGNS)]:
-        if not {laser, *signs} <= columns.keys():
-            continue
+    for laser, signs in _list_fused(columns):
         is_lost = {name: np.isnan(columns[name]) for name in (laser, *signs)}
         lossy = [name for name in signs if is_lost[name].any()]
         is_alone = is_lost[laser] & ~np.logical_or.reduce([is_lost[name] for name in signs])
