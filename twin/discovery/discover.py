@@ -45,7 +45,7 @@ from twin.discovery.selection import (
     select_effects,
 )
 from twin.discovery.signals import LogSignals, derives_acc
-from twin.discovery.starting_values import choose_start
+from twin.discovery.starting_values import choose_start, solve_columns
 from twin.discovery.verdict import DiscoveryVerdict, qualify_none, widen_for_form
 from twin.evidence.selection import RoundEffort
 from twin.evidence.verdict import judge_selection
@@ -126,10 +126,12 @@ def prepare_problem(
     pairs = [(log.signals, log.contact_n) for log in logs]
     log_residuals = build_log_residuals(pairs, model)
     _check_enough_data(log_residuals)
-    parameters = choose_start(log_residuals, initialize_parameters(log_residuals, model))
-    log_residuals = tuple(
-        replace(residuals, reference=parameters.to_model()) for residuals in log_residuals
-    )
+    given = initialize_parameters(log_residuals, model)
+    parameters = choose_start(log_residuals, given)
+    if parameters is not given:
+        log_residuals = tuple(
+            replace(residuals, reference=parameters.to_model()) for residuals in log_residuals
+        )
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
     fitted = first.parameters
     log_residuals = tuple(
@@ -242,10 +244,9 @@ def _input_gain(residuals: LogResiduals) -> float:
     """Estimate the gain of the table's acceleration: u'' = -k u - c u' - table_acc / gain."""
     m = residuals.motion()
     columns = np.array([m.u, m.v, m.table_acc])[:, m.moving]
-    size = np.abs(columns).max(axis=1, keepdims=True)
-    relative_acc = (m.acc - m.table_acc)[m.moving]
-    slope = np.linalg.lstsq((columns / size).T, relative_acc, rcond=None)[0][2] / size[2, 0]
-    return 1.0 / abs(float(slope)) if slope else 1.0
+    solution = solve_columns(columns, (m.acc - m.table_acc)[m.moving])
+    slope = 0.0 if solution is None else float(solution[2])
+    return 1.0 / abs(slope) if slope else 1.0
 
 
 def _check_enough_data(log_residuals: Sequence[LogResiduals]) -> None:

@@ -36,6 +36,8 @@ def measure_gaps(signals: LogSignals, contact_n: float) -> LogSignals:
 
     `contact_n` is a least contact threshold in N.
     """
+    if all(map(math.isfinite, signals.gaps_m)):
+        return signals
     m = signals.fuse_motion()
     if not m.has_load_cells:
         return signals
@@ -66,7 +68,7 @@ def _read_start(log_residuals: Sequence[LogResiduals], parameters: ParameterSet)
         errors = [fit[2] - stated for fit, stated in fitted if math.isfinite(stated)]
         if errors:
             read[GapKey(residuals.log_number)] = float(np.mean(errors))
-    linear = _solve(np.concatenate(columns, axis=1), np.concatenate(forces))
+    linear = solve_columns(np.concatenate(columns, axis=1), np.concatenate(forces))
     if linear is None:
         return parameters
     bumper = np.mean([fit[:2] for fit in pushes], axis=0) if pushes else linear[3:]
@@ -91,13 +93,13 @@ def _fit_push(
     """Return K_j, C_j and the gap in m of a side; None unless its cells show a bumper."""
     sign, push = ((1.0, m.right), (-1.0, m.left))[side]
     used = in_contact & m.moving & m.good & np.isfinite(push)
-    fit = _solve(np.array([sign * m.u, sign * m.v, -np.ones(m.u.size)])[:, used], push[used])
+    fit = solve_columns(np.array([sign * m.u, sign * m.v, -np.ones(m.u.size)])[:, used], push[used])
     if fit is None or fit[0] <= 0.0:
         return None
     return float(fit[0]), float(fit[1]), float(fit[2] / fit[0])
 
 
-def _solve(columns: Float2D, force: Float1D) -> Float1D | None:
+def solve_columns(columns: Float2D, force: Float1D) -> Float1D | None:
     """Return the coefficients of the columns, (column,); None with too few samples, (sample,)."""
     if force.size < MIN_SAMPLES:
         return None
