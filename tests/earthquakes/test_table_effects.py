@@ -341,7 +341,7 @@ def test_a_named_effect_is_described_with_equation_and_source() -> None:
         effects=(EFFECT_BY_ID["backlash"],), names=("backlash",), fit=fit, gap=0.05
     )
     verdict = SelectionVerdict("named", best, 0.99, 0.99, (), False, "the residual is noise", "")
-    without: Any = SimpleNamespace(effects=(), fit=fit, gap=0.1)
+    without: Any = SimpleNamespace(effects=(), names=(), fit=fit, gap=0.1)
     discovery: Any = SimpleNamespace(verdict=verdict, basic=without, fitted=best)
     lines = describe_discovery(discovery)
     assert lines[0] == ("missing effects: named, with a probability of 0.99: the residual is noise")

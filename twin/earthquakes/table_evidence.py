@@ -164,12 +164,12 @@ class TableProblem:
         trials = [sizes] + [
             sizes | _name_values(effect, trial) for effect in effects for trial in effect.trials
         ]
-        bounds = {name: ends for effect in effects for name, ends in effect.bounds.items()}
         starts = [base | trial for trial in trials]
         misfits = map_in_threads(self.rehearsal.measure_misfit, starts)
         start = starts[int(np.argmin(misfits))]
         after = _fit_effects(self.rehearsal, effects, start)
         if min(misfits) > MAX_WARM_GAP:
+            bounds = {name: ends for effect in effects for name, ends in effect.bounds.items()}
             from_nothing = FittedTable(effects, fit_basic_twin(self.rehearsal, bounds, trials))
             after = min(after, from_nothing, key=lambda fitted: fitted.squares)
         return after
@@ -275,8 +275,7 @@ def _fit_effects(
     evaluations: int = MAX_EVALUATIONS,
 ) -> FittedTable:
     """Return a fit with some effects, from values near it."""
-    bounds = {name: ends for effect in effects for name, ends in effect.bounds.items()}
-    free = {**BOUNDS, **bounds}
+    free = {**BOUNDS, **{name: ends for effect in effects for name, ends in effect.bounds.items()}}
     start = {name: start[name] for name in free}
     fit = fit_table(rehearsal, free, start, evaluations, WARM_TOLERANCE)
     return FittedTable(tuple(effects), fit)
@@ -288,7 +287,7 @@ def discover_table_effects(
     """Find which effects of LIBRARY the basic twin lacks; `report` gets the stage in words."""
 
     def tell(progress: SelectionProgress[FittedTable]) -> None:
-        names = " and ".join(name.replace("_", " ") for name in progress.names)
+        names = _join_names(progress.names)
         report(f"fitting {names}" if names else "comparing the effects of a table")
 
     def search(about: FittedTable, null: FittedTable, count: int) -> _Searched:
@@ -314,6 +313,11 @@ def discover_table_effects(
     return EffectDiscovery(selection, verdict, without, fitted)
 
 
+def _join_names(names: Sequence[str]) -> str:
+    """Return the names of effects as words."""
+    return " and ".join(name.replace("_", " ") for name in names)
+
+
 def describe_discovery(discovery: EffectDiscovery) -> list[str]:
     """Return the outcome in words, a line each: verdict, effects, what is not judged."""
     verdict = discovery.verdict
@@ -323,9 +327,8 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
         f"missing effects: {verdict.outcome}, with a probability of {verdict.confidence:.3g}: "
         f"{verdict.reason}"
     ]
-    kept = {effect.id for effect in fitted.effects}
-    if dropped := [name for name in verdict.best.names if name not in kept]:
-        names = " and ".join(name.replace("_", " ") for name in dropped)
+    if dropped := [name for name in verdict.best.names if name not in fitted.names]:
+        names = _join_names(dropped)
         lines.append(f"  not kept in the twin, which predicts better without: {names}")
     if verdict.place:
         lines.append(f"  what no effect explains lies in: {verdict.place}")
@@ -341,8 +344,7 @@ def describe_discovery(discovery: EffectDiscovery) -> list[str]:
     change = f"{100 * without.gap:.3g} % -> " if fitted.effects else ""
     lines.append(f"  left on held-out data: {change}{100 * fitted.gap:.3g} % of the motion")
     for other in verdict.alternatives:
-        names = " and ".join(name.replace("_", " ") for name in other.names)
-        lines.append(f"  cannot be told apart from {names}")
+        lines.append(f"  cannot be told apart from {_join_names(other.names)}")
     lines.append("cannot be judged from this rehearsal:")
     lines += [f"  {name}: {reason}" for name, reason in UNTESTED.items()]
     return lines
