@@ -150,18 +150,18 @@ class _StatedSpecimen:
     def from_map(cls, column_map: ColumnMap | None) -> "_StatedSpecimen":
         return cls() if column_map is None else cls(column_map.mass_kg, column_map.gap_mm)
 
-    def refuse_beside(self, place: str, stated: Mapping[str, Any]) -> None:
-        """Raise InputError if mass or gap are among what is stated beside a profile."""
+    def refuse_beside(self, place: str) -> None:
+        """Raise InputError if mass or gap are stated beside a profile."""
         for key, value in asdict(self).items():
-            if value is not None and stated.get(key) is not None:
+            if value is not None:
                 problem = f"{place} states the {key.split('_')[0]}"
                 raise InputError(problem, key=key, value=value, remedy="leave one out")
 
     def describe(self) -> dict[str, str]:
         """Return the words for mass and bumpers."""
         mass = "unit mass" if self.mass_kg is None else f"{self.mass_kg:g} kg"
-        bumpers = "no gap stated" if self.gap_mm is None else f"a gap of {self.gap_mm:g} mm"
-        bumpers = "no bumpers" if self.gap_mm == math.inf else bumpers
+        named = {None: "no gap stated", math.inf: "no bumpers"}
+        bumpers = named.get(self.gap_mm) or f"a gap of {self.gap_mm:g} mm"
         return {"mass": mass, "bumpers": bumpers}
 
 
@@ -388,13 +388,14 @@ def _build_run_config(
     if profile is None and _has_config_texts(table):
         profile_toml, model_toml = table.texts["profile_toml"], table.texts["model_toml"]
         file_profile = parse_toml(profile_toml, Profile, f"profile in {file}")
-        specimen.refuse_beside("the profile in the file", options.settings)
+        stated = options.apply_settings(None)  # a map may be proposed from what the file states
+        _StatedSpecimen.from_map(stated).refuse_beside("the profile in the file")
         if file_profile.acquisition.rate_hz != rate_hz:
             profile_toml = _set_rate(profile_toml, rate_hz)
         return from_texts(file.stem, profile_toml, rig_toml, model_toml, f"config in {file}")
     if profile is None:
         return _build_placeholder(table, rig_toml, rate_hz, labels, specimen)
-    specimen.refuse_beside("the profile", asdict(specimen))
+    specimen.refuse_beside("the profile")
     test_profile, text = load_profile(profile)
     model_toml = read_model(test_profile.model, profile)[1]
     source = f"{profile}, at the {rate_hz:g} Hz of {file}"
