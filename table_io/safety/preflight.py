@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from decimal import ROUND_DOWN, Context
 
 import numpy as np
 
@@ -368,8 +369,7 @@ def _suggest_level(rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfi
 
 def _round_towards_zero(value: float) -> float:
     """Return a value with three significant digits, none larger than it in magnitude."""
-    unit = 10.0 ** (math.floor(math.log10(abs(value))) - 2)
-    return math.trunc(value / unit) * unit
+    return float(Context(prec=3, rounding=ROUND_DOWN).create_decimal_from_float(value))
 
 
 def _find_exceeded_limits(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from table_io.block import Float1D, Label
@@ -431,6 +431,7 @@ def test_history_beyond_a_limit_is_refused_with_the_level_that_fits(
     ],
 )
 @given(excess=st.floats(1.01, 1e3), level=st.floats(1e-3, 10.0), has_points=st.booleans())
+@example(excess=10.0, level=1.0, has_points=False)  # a hair below a power of ten
 @LAW
 def test_level_that_fits_is_in_proportion_to_the_largest_excess(
     demand: str,
