@@ -573,7 +573,8 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     starts below and ends above it); two more, up to the fifth harmonic of the highest frequency, if
     harmonics are canceled. Where an amplitude has fewer DAC steps than `output.least_lsb`, the
     level is raised to at most a tenth of the test level; beyond that the frequency is lowered, and
-    the response above it is extrapolated. A rig with friction may ask for a larger level.
+    the response above it is extrapolated. A rig with friction may ask for a larger level, at which
+    higher frequencies are resolved.
     """
     plan, settings = profile.plan, profile.loop_check
     test_level = plan.level_m_s2
@@ -581,7 +582,8 @@ def plan_targets(profile: Profile, rig: RigConfig) -> tuple[SineTarget, ...]:
     min_amplitude_m = rig.output.least_lsb * rig.output.lsb_m
 
     def limit_frequency(f: float) -> float:
-        resolvable_hz = math.sqrt(MAX_LEVEL_RATIO * test_level / min_amplitude_m) / (2 * math.pi)
+        highest = max(MAX_LEVEL_RATIO * test_level, lowest)
+        resolvable_hz = math.sqrt(highest / min_amplitude_m) / (2 * math.pi)
         return min(f, resolvable_hz, rig.limits.frequency_hz)
 
     requested_hz = list(settings.frequencies_hz)

@@ -476,9 +476,16 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
     if targets and max(target.frequency_hz for target in targets) < 0.999 * requested_hz:
         highest_hz = max(target.frequency_hz for target in targets)
         messages.append(
-            f"the loop check ends at {highest_hz:.3g} Hz: at {requested_hz:g} Hz a tenth of the "
-            f"level has fewer than {rig.output.least_lsb} DAC steps; the response above "
-            f"{highest_hz:.3g} Hz is extrapolated"
+            f"the loop check ends at {highest_hz:.3g} Hz: at {requested_hz:g} Hz its level has "
+            f"fewer than {rig.output.least_lsb} DAC steps; the response above {highest_hz:.3g} Hz "
+            "is extrapolated"
+        )
+    level_g, least_g = profile.plan.level_m_s2 / GRAVITY_M_S2, rig.table_response.least_level_g
+    if level_g < least_g:
+        messages.append(
+            f"the level is {level_g:.3g} g at most, below table_response.least_level_g = "
+            f"{least_g:g}: friction shapes what this table plays, and the loop check may refuse "
+            "its gain or delay; raise the level"
         )
     if {"acceleration_g", "level_points"} <= profile.excitation.model_fields_set:
         kind = profile.excitation.kind

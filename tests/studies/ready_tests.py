@@ -25,6 +25,7 @@ from table_io.records import RunStop
 from twin.rig.check import check_test
 from twin.setup.run_config import RunConfig
 
+KINDS = ("sweep", "sweep", "record", "long record", "random", "multisine", "swept_sine")
 RECORDS = ("el_centro", "kobe", "erzincan", "newhall", "rinaldi", "sylmar", "chi_chi")
 PROFILE = """
 title = "ready"
@@ -40,20 +41,28 @@ rate_hz = {rate:.0f}
 
 def draw_profile(rng: np.random.Generator, folder: Path) -> str:
     """Write a profile and its rig; return its kind."""
-    kind = str(rng.choice(["sweep", "sweep", "record", "long record", "random", "swept_sine"]))
+    kind = str(rng.choice(KINDS))
     rate = float(rng.choice([1000.0, 2000.0]))
-    text = PROFILE.format(mass=rng.uniform(200, 900), gap=rng.uniform(0.5, 20.0), rate=rate)
+    gap_mm = float(rng.choice([rng.uniform(0.5, 20.0), rng.uniform(-3.0, 0.0), np.inf]))
+    text = PROFILE.format(mass=rng.uniform(200, 900), gap=gap_mm, rate=rate)
     level = 10 ** rng.uniform(-2.3, -0.5)
     low = 10 ** rng.uniform(-0.7, 0.6)
     if kind == "sweep":
+        step_hz = round(low * rng.uniform(0.05, 0.3), 3)
+        stop_hz = low + step_hz * rng.integers(2, 20)
         text += (
-            f"[sweep]\nstart_hz = {low:.3f}\nstop_hz = {low * rng.uniform(1.2, 6.0):.3f}\n"
-            f"step_hz = 0.5\ncycles = 4\nmeasured_cycles = 2\nacceleration_g = {level:.4f}\n"
+            f"[sweep]\nstart_hz = {low:.3f}\nstop_hz = {stop_hz:.3f}\n"
+            f"step_hz = {step_hz}\ncycles = 4\nmeasured_cycles = 2\nacceleration_g = {level:.4f}\n"
         )
     elif kind == "swept_sine":
         text += (
             f'[excitation]\nkind = "swept_sine"\nstart_hz = {low:.3f}\n'
             f"stop_hz = {low * rng.uniform(2, 10):.3f}\nacceleration_g = {level:.4f}\n"
+        )
+    elif kind == "multisine":
+        text += (
+            f'[excitation]\nkind = "multisine"\nlow_hz = {low:.3f}\nhigh_hz = '
+            f"{low * rng.uniform(3, 15):.3f}\nrms_g = {level / 3:.4f}\nduration_s = 8\n"
         )
     elif kind == "random":
         text += (

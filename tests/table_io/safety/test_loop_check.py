@@ -166,6 +166,15 @@ def test_plan_targets_raises_amplitudes_below_the_converter(bits: int, level: fl
         assert targets[-1].level_m_s2 > 3 * targets[0].level_m_s2
 
 
+def test_plan_targets_reaches_the_top_at_the_level_that_friction_asks_for() -> None:
+    ends_hz = []
+    for least_level_g in (0.0, 0.05):
+        rig = change_rig(output={"bits": 15}, table_response={"least_level_g": least_level_g})
+        ends_hz.append(plan_targets(read_shipped_profile("gm10"), rig)[-1].frequency_hz)
+    assert ends_hz[0] < 9.0
+    assert ends_hz[1] == pytest.approx(10.0)
+
+
 def test_count_hold_cycles_for_two_seconds_at_least() -> None:
     profile = read_shipped_profile("gm10", loop_check={"cycles": 7})
     held = [count_hold_cycles(aim, profile) - SETTLE_CYCLES for aim in plan_targets(profile, RIG)]

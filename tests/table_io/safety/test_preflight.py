@@ -545,6 +545,16 @@ def test_loop_check_that_ends_below_the_sweep_is_worth_a_warning(
     assert list_setup_warnings(make_test(loop_check=check | {"enabled": False}), rig) == []
 
 
+@pytest.mark.parametrize(("least_level_g", "count"), [(0.0, 0), (0.05, 0), (0.0501, 1)])
+def test_level_at_which_friction_shapes_the_motion_is_worth_a_warning(
+    least_level_g: float, count: int
+) -> None:
+    rig = change_rig(table_response={"least_level_g": least_level_g})
+    warnings = list_setup_warnings(make_test(), rig)
+    assert len(warnings) == count
+    assert all("friction shapes what this table plays" in warning for warning in warnings)
+
+
 # The command corrected for the response of the table
 
 
