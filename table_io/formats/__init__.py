@@ -27,7 +27,7 @@ from table_io.formats.strong_motion import (
     parse_smc,
     parse_volume_2,
 )
-from table_io.formats.table import ForeignTable
+from table_io.formats.table import ForeignTable, check_column_count
 from table_io.formats.text import parse_table
 
 FORMATS = {  # module by suffix
@@ -86,7 +86,9 @@ def read_table(path: Path, group: str = "") -> ForeignTable:
             f"{', '.join(dropped) or 'nothing'}",
             where=path,
         )
-    return table.select_group(group.strip("/"))
+    selected = table.select_group(group.strip("/"))
+    check_column_count(len(selected.columns), path)
+    return selected
 
 
 def parse_text(text: str, name: str) -> ForeignTable:

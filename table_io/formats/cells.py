@@ -25,7 +25,7 @@ from table_io.formats.layout import (
     strip_cells,
     use_decimal_point,
 )
-from table_io.formats.table import ForeignTable, make_column
+from table_io.formats.table import ForeignTable, check_column_count, make_column
 from table_io.formats.words import normalize_unit
 
 MAX_QUOTED_CHARS = 40  # of a cell in a message
@@ -122,6 +122,7 @@ def read_cells(
     path: Path, kind: str, layout: TableLayout, rows: Iterator[CellRow], sheet: str = ""
 ) -> ForeignTable:
     """Read the table of the rows from the first one of samples; `kind` says what the file is."""
+    check_column_count(layout.width, path)
     reader = _CellReader(layout, f"{path}: sheet {sheet!r}" if sheet else str(path))
     notes = []
     for number, cells in rows:

@@ -34,7 +34,7 @@ MAX_REFERENCES = 1000  # of a cell array
 
 def scan_columns(path: Path) -> ForeignTable:
     """Scan the datasets of a file; values are not read."""
-    table, notes = ForeignTable(path, "", load=load_column), list[str]()
+    table, notes = ForeignTable(path, "", loader="hdf5"), list[str]()
     with h5py.File(path, "r") as file:
 
         def visit(name: str, item: Any) -> None:

@@ -44,7 +44,7 @@ def scan_columns(path: Path) -> ForeignTable:
 
         return read_hdf5(path)
     _check_compression(path)
-    table = ForeignTable(path, "", load=load_column)
+    table = ForeignTable(path, "", loader="mat")
     for name, shape, kind in whosmat(path):
         if kind == "struct":
             _add_structure(table, name, (name,), _load_variable(path, name))

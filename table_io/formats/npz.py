@@ -12,7 +12,7 @@ from table_io.formats.words import add_fact, find_fact
 
 def scan_columns(path: Path) -> ForeignTable:
     """Scan the array headers of a file; values are not read."""
-    table = ForeignTable(path, "", load=load_column)
+    table = ForeignTable(path, "", loader="npz")
     with zipfile.ZipFile(path) as archive:
         for member in archive.namelist():
             with archive.open(member) as file:

@@ -21,7 +21,7 @@ TIME_TYPES = (pa.types.is_timestamp, pa.types.is_duration)
 
 def scan_columns(path: Path) -> ForeignTable:
     """Scan the columns in the schema of a file; values are not read."""
-    table = ForeignTable(path, "", load=load_column)
+    table = ForeignTable(path, "", loader="parquet")
     with pq.ParquetFile(path) as file:
         schema, rows = file.schema_arrow, file.metadata.num_rows
     for column in schema:

@@ -4,8 +4,9 @@ A format's `scan_columns` describes the columns; values that are long are read o
 `load_column`, in a process of their own.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ MAX_ROWS = 2**27  # of a column: 18 h at 2 kHz
 MAX_BYTES = 2**32  # of all columns that are read, as float64
 MAX_EXPANSION = 200  # uncompressed size over file size, plus EXPANSION_BYTES
 EXPANSION_BYTES = 2**26
+MAX_COLUMNS = 4096  # of a table or a group: hundreds of channels, several runs of them
 MAX_MATRIX_COLUMNS = 64  # of a two-dimensional array
 MAX_EXACT_INTEGER = 2**53  # largest range that float64 represents exactly
 KIND_NAMES = {
@@ -69,7 +71,7 @@ class ForeignTable:
     rows: Int1D | None = None  # row numbers of all samples, if lines between them are no samples
     texts: dict[str, str] = field(default_factory=dict)
     facts: dict[str, float] = field(default_factory=dict)
-    load: Callable[[Path, ColumnKey], Any] | None = None  # reads the values of a column
+    loader: str = ""  # module of this package whose `load_column` reads the values of a column
 
     def describe_row(self, place: int) -> str:
         """Return the file and the row in it of the sample at `place`, from 0."""
@@ -84,8 +86,7 @@ class ForeignTable:
         source, column = f"{self.path}: column {name!r}", self.columns[name]
         values: Any = column.values
         if values is None:
-            assert self.load is not None
-            load = self.load
+            load = import_module(f"table_io.formats.{self.loader}").load_column
             values = np.asarray(run_isolated(self.path, lambda: load(self.path, column.key)))
         if values.dtype.kind == "M":
             values = values - values[:1]
@@ -197,6 +198,17 @@ def extract_column(array: Any, k: int) -> Any:
     array = array.reshape([length for length in array.shape if length != 1])
     is_tall = array.ndim < 2 or array.shape[0] >= array.shape[1]
     return array.reshape(max(array.shape), -1)[:, k] if is_tall else array[k]
+
+
+def check_column_count(count: int, path: Path) -> None:
+    """Raise InputError if a table has more columns than the channels of any laboratory."""
+    if count > MAX_COLUMNS:
+        raise InputError(
+            f"{count} columns",
+            where=path,
+            allowed=f"up to {MAX_COLUMNS}",
+            remedy="export the channels of the test alone, or name one group of the file",
+        )
 
 
 def check_expansion(size: int, path: Path) -> None:

@@ -18,7 +18,7 @@ def scan_columns(path: Path) -> ForeignTable:
     with TdmsFile.open(path) as file:
         is_truncated = file.file_status.incomplete_final_segment
         notes = ("warning: the file ends inside a segment",) if is_truncated else ()
-        table = ForeignTable(path, "", notes=notes, load=load_column)
+        table = ForeignTable(path, "", notes=notes, loader="tdms")
         begins = {
             (group.name, channel.name): np.datetime64(channel.properties["wf_start_time"])
             for group in file.groups()

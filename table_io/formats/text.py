@@ -24,7 +24,7 @@ from table_io.formats.layout import (
     is_number,
     turn_rows,
 )
-from table_io.formats.table import ForeignTable, TableColumns
+from table_io.formats.table import ForeignTable, TableColumns, check_column_count
 from table_io.formats.words import read_facts
 
 BLANKS = " "  # one or more of them, or tabs
@@ -41,6 +41,8 @@ def parse_table(file: TextIO, path: Path) -> ForeignTable:
     """Read the table in a text; raise InputError that names the invalid row and column."""
     lines = _iter_lines(file, path)
     head = list(islice(lines, MAX_HEAD_ROWS))
+    marks = (line.count(mark) for line in head for mark in DELIMITERS if mark != BLANKS)
+    check_column_count(max(marks, default=0), path)  # before each cell of the head is judged
     delimiter, layout = _find_layout(head)
     kind = f"a text table, separated by {DELIMITERS[delimiter]}"
     if layout is not None and (rows := turn_rows(_separate_head(head, delimiter)[0], layout)):

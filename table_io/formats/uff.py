@@ -29,7 +29,7 @@ def scan_columns(path: Path) -> ForeignTable:
         )
     headers = {k: file.read_sets(k, header_only=True) for k, kind in enumerate(types) if kind == 58}
     name_counts = Counter(_header_text(head, "id1") for head in headers.values())
-    table = ForeignTable(path, "", load=load_column)
+    table = ForeignTable(path, "", loader="uff")
     for k, header in headers.items():
         line = _header_text(header, "id1")
         name = line if line and name_counts[line] == 1 else f"set {k + 1} {line}".strip()

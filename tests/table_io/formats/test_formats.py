@@ -1,9 +1,11 @@
 """Binary formats: one recording out of each of them, what is no column, and hostile files."""
 
+import ctypes
 import os
 import random
 import re
 import signal
+import socket
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -502,3 +504,69 @@ def test_run_isolated_survives_a_reader_that_dies(
     (tmp_path / "x").touch()
     with raises_input_error(where=tmp_path / "x", problem=words):
         sandbox.run_isolated(tmp_path / "x", work, max_cpu_s=1)
+
+
+class Intrusion:
+    """Object whose pickle calls a function of the process that reads it."""
+
+    def __reduce__(self) -> Any:
+        return os.getpid, ()
+
+
+def test_run_isolated_refuses_an_answer_that_is_no_table(tmp_path: Path) -> None:
+    (tmp_path / "x").touch()
+    with raises_input_error(where=tmp_path / "x", problem="its reader crashed"):
+        sandbox.run_isolated(tmp_path / "x", Intrusion)
+
+
+def connect(path: Path) -> None:
+    socket.create_connection(("127.0.0.1", int(path.read_text())), timeout=5.0)
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        lambda path: path.write_text("written"),
+        lambda path: path.unlink(),
+        lambda path: (path.parent / "new").mkdir(),
+        lambda path: os.execv("/bin/true", ["true"]),
+        lambda path: os.kill(os.getppid(), 0),
+        connect,
+    ],
+    ids=["write", "remove", "make", "execute", "signal", "connect"],
+)
+def test_run_isolated_leaves_a_reader_no_right_but_to_read(
+    tmp_path: Path, act: Callable[[Path], Any]
+) -> None:
+    if ctypes.CDLL(None).syscall(sandbox.LANDLOCK_CREATE_RULESET, None, 0, 1) < 6:
+        pytest.skip("this kernel has not all of Landlock")
+
+    def work() -> None:
+        with pytest.raises(PermissionError):
+            act(path)
+        raise InputError(path.read_text())
+
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        path = tmp_path / "x"
+        path.write_text(str(server.getsockname()[1]))
+        with raises_input_error(problem=path.read_text()):
+            sandbox.run_isolated(path, work)
+    assert [*tmp_path.iterdir()] == [path]
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_table_of_more_columns_than_any_laboratory_has_is_refused(
+    tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("table_io.formats.table.MAX_COLUMNS", 3)
+    for count in (3, 4):
+        names = [f"c{number}" for number in range(count)]
+        path = tmp_path / f"{count}.{suffix}"
+        if suffix == "csv":
+            path.write_text("\n".join([",".join(names), *[",".join("1" * count)] * 9]))
+        else:
+            arrays: dict[str, Any] = dict.fromkeys(names, np.ones(9))
+            np.savez(path, **arrays)
+    assert len(read_table(tmp_path / f"3.{suffix}").columns) == 3
+    with raises_input_error(where=path, problem="4 columns", allowed="up to 3"):
+        read_table(path)
