@@ -163,6 +163,36 @@ def test_find_doubts_of_an_accelerometer(alter: Callable[[Float1D], Float1D], ki
     assert (doubt.kind, {*doubt.channels}) == (kind, {*table})
 
 
+@pytest.mark.parametrize(("drift_s", "middle_s"), [(0.04, 0.0), (-0.04, 0.0), (0.04, 50.0)])
+def test_find_doubts_of_clocks_that_drift(drift_s: float, middle_s: float) -> None:
+    """Where they agree at first, or in the middle, so that no mean delay is left."""
+    time = np.arange(20_000) / RATE_HZ
+    disp = 0.01 * np.sin(2 * np.pi * 0.9 * time) + 0.004 * np.sin(15.0 * time)
+    acc = np.gradient(np.gradient(disp, time), time)
+    late = np.interp(time - drift_s * (time - middle_s) / time[-1], time, acc)
+    assert find_doubts({"table_disp_m": disp, "table_acc_m_s2": acc}, RATE_HZ) == []
+    (doubt,) = find_doubts({"table_disp_m": disp, "table_acc_m_s2": late}, RATE_HZ)
+    assert doubt.kind == "drifting"
+    assert f"{abs(drift_s):g} s" in doubt.problem
+
+
+@pytest.mark.parametrize("amplification", [0.1, 0.7, 1.3, 8.0])
+def test_find_doubts_of_a_laser_on_the_table(amplification: float) -> None:
+    """At any motion of the mass that its own noise does not hide."""
+    mass = amplification * np.roll(DISP, 12)
+    accs = [np.gradient(np.gradient(disp, TIME), TIME) for disp in (DISP, mass)]
+    channels = {
+        "table_disp_m": CLEAN["rel_disp_m"],
+        "table_acc_m_s2": accs[0] + 0.01 * NOISE[0],
+        "mass_disp_m": mass + 1e-5 * NOISE[1],
+        "mass_acc_m_s2": accs[1] + 0.01 * NOISE[1],
+    }
+    assert find_doubts(channels, RATE_HZ) == []
+    (doubt,) = find_doubts({**channels, "mass_disp_m": mass - DISP}, RATE_HZ)
+    assert doubt.kind == "mounted"
+    assert "rel_disp_m" in doubt.remedy
+
+
 def test_find_doubts_takes_no_narrow_band_for_a_delay() -> None:
     """A slow sweep, whose lines lie so close that a delay and a high pass look alike."""
     for low_hz, high_hz, corner_hz in ((0.84, 1.36, 0.0), (2.5, 3.3, 0.0), (1.6, 2.4, 0.25)):

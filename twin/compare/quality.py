@@ -11,6 +11,8 @@ A channel as a whole is a question, since only its owner knows what happened to 
     held       each reading stands in several samples: a slower converter
     reversed   its sign contradicts another channel, or the work of a passive component
     delayed    its motion is that of another channel at another time
+    drifting   its clock is another one than that of a channel of the same motion
+    mounted    it stands on the table, where it should stand on the floor
     swapped    it shows what another channel should
 
 Nothing here knows the specimen: a finding compares a channel with itself or with another one of
@@ -20,6 +22,7 @@ is said to have been played.
 
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -67,7 +70,7 @@ MAX_DELAY_S, MAX_DELAY_SAMPLES = 4e-3, 3.0  # of filters and multiplexers; the l
 MIN_GAIN_IN_CORRELATION = 0.03  # by a delay of many samples
 DELAY_SIGMA = 4.0
 MAX_PHASE_LEFT = 0.25  # of the phases, or of what a high pass leaves, by a delay that is one
-PART_COUNT = 8  # of a test, in which the work of a force is added up
+PART_COUNT = 8  # of a test, in which the work of a force is added up, or a delay is measured
 MAX_TAKEN_SHARE = 0.1  # of the work done by a force: work taken, by a force that is reversed
 # Of confused units: g, mm, inch, cm, in/s2 and their combinations.
 UNIT_FACTORS = (9.80665, 1000.0, 25.4, 2.54, 100.0, 39.3701, 386.089, 980.665, 9806.65, 10.0)
@@ -75,6 +78,8 @@ MAX_FACTOR_ERROR = 0.05  # of gains of sensors, which are off by less
 MIN_LOSS, MIN_WORK = 0.01, 0.1  # of the force: smaller work is that of sensors, or of filters
 MIN_SIDE_CORRELATION = 0.3  # of the force of a bumper with the displacement towards it
 MIN_REVERSED_PULL = 5.0  # of a load cell, over its push
+# Of what an expectation leaves of a channel, by one that is the right one: over the other's.
+MAX_BETTER_SHARE = 0.3
 COMPARED_PAIRS = (  # displacement, the channels (with signs) that are its second derivative
     ("table_disp_m", {"table_acc_m_s2": 1.0}),
     ("mass_disp_m", {"mass_acc_m_s2": 1.0}),
@@ -88,7 +93,7 @@ Spectrum = npt.NDArray[np.complex128]
 class ChannelDoubt:
     """What makes channels impossible as they are; `remedy` is what a map of an import can state."""
 
-    kind: str  # held, reversed, delayed, swapped
+    kind: str  # held, reversed, delayed, drifting, mounted, swapped
     channels: tuple[str, ...]
     problem: str
     remedy: str
@@ -397,7 +402,14 @@ def find_doubts(channels: Mapping[str, Float1D], rate_hz: float) -> list[Channel
     doubts = [*_list_held(judged, rate_hz), *_list_pulling_cells(judged)]
     if doubts:  # it may be the reason for what pairs show
         return doubts
-    for list_doubts in (_list_swapped, _list_pairs, _list_active_force, _list_swapped_sides):
+    for list_doubts in (
+        _list_swapped,
+        _list_mounted,
+        _list_drifting,
+        _list_pairs,
+        _list_active_force,
+        _list_swapped_sides,
+    ):
         if doubts := [*list_doubts(judged, rate_hz)]:
             return doubts
     return []
@@ -571,6 +583,59 @@ def _list_pairs(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[Cha
             )
 
 
+def _list_mounted(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[ChannelDoubt]:
+    """Yield the laser of a mass that reads mass less table, as one that stands on the table."""
+    names = ("mass_disp_m", "mass_acc_m_s2", "table_acc_m_s2")
+    if not channels.keys() >= {*names}:
+        return
+    disp, mass, table = (channels[name] for name in names)
+    on_floor, on_table = (_respond(disp, acc, rate_hz, 2) for acc in (mass, mass - table))
+    if on_floor is None or on_table is None:
+        return
+    if on_table.share < MAX_BETTER_SHARE * min(on_floor.share, 1.0):
+        yield ChannelDoubt(
+            "mounted",
+            names,
+            "the second derivative of mass_disp_m is the acceleration of the mass less that of the "
+            "table: the laser looks mounted on the table",
+            "state its column as rel_disp_m in a map",
+        )
+
+
+def _list_drifting(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[ChannelDoubt]:
+    """Yield sensors of one body whose clocks drift apart: their delay changes with time.
+
+    The phases of all parts are fitted by high pass and delay, with a drift and without.
+    """
+    for position, name, acc in _list_present_pairs(channels):
+        phases, columns = [], []
+        for first, end in pairwise(np.linspace(0, acc.size, PART_COUNT + 1).astype(int).tolist()):
+            read, expected = acc[first:end], channels[position][first:end]
+            if not (np.isfinite(read).any() and np.isfinite(expected).any()):
+                continue
+            lines = _compare_lines(expected, read, rate_hz, 2, np.hanning(read.size))
+            if lines is not None:
+                omega, g, y, _ = lines
+                weight = np.sqrt(np.abs(g * y))
+                phases.append(weight * np.angle(np.conj(g) * y))
+                middle_s = 0.5 * (first + end) / rate_hz
+                columns.append(weight * np.array([1.0 / omega, -omega, -omega * middle_s]))
+        if len(phases) < 3:
+            continue
+        phase, matrix = np.concatenate(phases), np.concatenate(columns, axis=1).T
+        fits = [np.linalg.lstsq(matrix[:, :count], phase)[0] for count in (2, 3)]
+        steady, left = (float(np.sum((phase - matrix[:, : fit.size] @ fit) ** 2)) for fit in fits)
+        seconds = acc.size / rate_hz
+        if abs(fits[1][2]) * seconds > _max_delay(rate_hz) and left < MAX_PHASE_LEFT * steady:
+            yield ChannelDoubt(
+                "drifting",
+                (position, *name.split(" - ")),
+                f"{name} and {position} drift apart by {abs(fits[1][2]) * seconds:.2g} s in "
+                f"{seconds:.4g} s: they are of two clocks, {1e6 * abs(fits[1][2]):.2g} ppm apart",
+                "record both by one clock, or resample the channels of one to the other",
+            )
+
+
 def _list_swapped(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[ChannelDoubt]:
     """Yield channels that stand in each other's place."""
     for first, second in (
@@ -586,7 +651,7 @@ def _list_swapped(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[C
             for c in (channels, exchanged)
         )  # fmt: skip
         if as_is and all(
-            a is not None and b is not None and b.share < 0.3 * a.share and b.share < 0.3
+            a is not None and b is not None and b.share < MAX_BETTER_SHARE * min(a.share, 1.0)
             for a, b in zip(as_is, other, strict=True)
         ):
             yield ChannelDoubt(
