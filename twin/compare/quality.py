@@ -318,14 +318,17 @@ def _list_flat_tops(x: Float1D, depth: Float1D, least_height: float = 0.0) -> li
     at_ends = max((b - a for a, b in runs if a == 0 or b == x.size), default=0)
     if at_ends > MAX_END_RATIO * max((b - a for a, b in inner), default=0):  # it rests there
         return []
-    heights = [  # of parabolas as long as each part, with the speeds at its ends
-        0.25 * (b - a) * np.sort(np.abs([x[a - 1] - x[a - 2], x[b + 1] - x[b]]))
-        for a, b in inner
-        if b - a >= MIN_CLIPPED_RUN
-    ]
-    if not heights:
+    parts = np.array([(a, b) for a, b in inner if b - a >= MIN_CLIPPED_RUN])
+    if not parts.size:
         return []
-    lowest, highest = np.median(heights, axis=0)
+    first, end = parts.T
+    # Of parabolas as long as each part, with the speeds at its ends.
+    speeds = np.sort(np.abs([x[first - 1] - x[first - 2], x[end + 1] - x[end]]), axis=0)
+    lowest, highest = np.median(0.25 * (end - first) * speeds, axis=1)
+    if usual == 1:  # the peaks of a fine channel are flat where they are rounded
+        step = np.abs(np.diff(x))
+        rounding = np.median(1.0 + 0.5 * (end - first)) * step[step > 0.0].min()
+        least_height = max(least_height, float(rounding))
     return inner if least_height <= lowest and highest <= MAX_OVERSHOOT * np.ptp(x) else []
 
 
