@@ -82,6 +82,18 @@ def test_record_beyond_the_rig_states_the_largest_scale(tmp_path: Path) -> None:
     assert (out / "record_1.csv").is_file()
 
 
+def test_record_ends_where_the_rig_does(tmp_path: Path) -> None:
+    """A spectrum up to 45 Hz, whose record would reach half an octave further, for 50 Hz."""
+    path = write_spectrum(tmp_path, [(5.0, 0.1), (12.0, 0.3), (25.0, 0.3), (45.0, 0.2)])
+    out = tmp_path / "out"
+    ended = call_main("record", path, "--like", "rehearsal", "--out", out)
+    assert ended.returncode == 0, ended.stderr
+    path.write_text(path.read_text().replace("45.0", "70.0"))
+    ended = call_main("record", path, "--like", "rehearsal", "--out", tmp_path / "beyond")
+    assert ended.returncode == 2
+    assert "at most 50" in ended.stderr
+
+
 @pytest.mark.parametrize(
     ("high_hz", "duration_s", "message"), [(201.0, 30.0, "rate_hz"), (200.0, 46.0, "45 s")]
 )

@@ -17,8 +17,9 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.config.base import format_toml, read_text
 from table_io.config.excitation.waveform import smoothstep
-from table_io.config.folders import resolve_config
+from table_io.config.folders import find_config, resolve_config
 from table_io.config.profile import MAX_FILE_BYTES, Profile, load_profile
+from table_io.config.rig_file import load_rig
 from table_io.config.tracking import RequiredSpectrum, parse_required_spectrum
 from table_io.errors import InputError
 from table_io.units import GRAVITY_M_S2
@@ -92,9 +93,11 @@ def make_spectrum_records(
     spectrum: RequiredSpectrum,
     shape: RecordShape,
     report: Callable[[str], None] = lambda stage: None,
+    highest_hz: float = math.inf,
 ) -> list[SpectrumRecord]:
     """Return records compatible with a required spectrum, each with phases of its own.
 
+    They end with the spectrum, or half an octave above it up to `highest_hz`, that of the rig.
     InputError if the record is too short for the lowest frequency of the spectrum.
     """
     shape.check()
@@ -107,7 +110,7 @@ def make_spectrum_records(
     records = []
     for number in range(shape.count):
         report(f"matching record {number + 1} of {shape.count}")
-        records.append(_match_record(spectrum, shape, shape.seed + number))
+        records.append(_match_record(spectrum, shape, shape.seed + number, highest_hz))
     return records
 
 
@@ -116,12 +119,15 @@ def _find_record_rate(high_hz: float) -> float:
     return max(MIN_RATE_HZ, 10.0 * math.ceil(0.1 * SAMPLES_PER_PERIOD * high_hz))
 
 
-def _match_record(spectrum: RequiredSpectrum, shape: RecordShape, seed: int) -> SpectrumRecord:
+def _match_record(
+    spectrum: RequiredSpectrum, shape: RecordShape, seed: int, highest_hz: float
+) -> SpectrumRecord:
     low_hz, high_hz = spectrum.frequencies_hz[[0, -1]].tolist()
     rate_hz = _find_record_rate(high_hz)
     count = round(shape.duration_s * rate_hz)
     f = np.fft.rfftfreq(count, 1.0 / rate_hz)
-    band = (f >= low_hz / BAND_MARGIN) & (f <= high_hz * BAND_MARGIN)
+    top_hz = min(high_hz * BAND_MARGIN, max(high_hz, highest_hz))
+    band = (f >= low_hz / BAND_MARGIN) & (f <= top_hz)
     ln_f = np.log(np.where(band, f, 1.0))
     raw = np.asarray(np.random.PCG64(seed).random_raw(f.size), dtype=np.uint64)
     phases = (raw >> np.uint64(11)) * 2.0**-53
@@ -203,8 +209,9 @@ def compute_spectrum_records(
     spectrum = parse_required_spectrum(text, options.spectrum.name)
     like_path = resolve_config(options.like, "tests")
     like, _ = load_profile(like_path)
+    rig, _ = load_rig(find_config(options.table or like.rig, "rigs", like_path))
     _check_test_plays(spectrum, options, like)
-    records = make_spectrum_records(spectrum, options.shape, report)
+    records = make_spectrum_records(spectrum, options.shape, report, rig.limits.frequency_hz)
     files, profiles = {options.spectrum.name: text}, []
     for number, record in enumerate(records, 1):
         stem = f"record_{number}"
