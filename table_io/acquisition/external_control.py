@@ -27,7 +27,6 @@ from table_io.acquisition.drive_follower import (
 )
 from table_io.acquisition.session import (
     ACCEPTED,
-    CLIP_RATIO,
     TARE_S,
     CommandSource,
     EventLog,
@@ -245,7 +244,9 @@ class _ExternalSession:
         self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
         self._max_samples = self.drive.rest_start + self._rest_samples
         self._lost_samples = 0  # of the command
-        self._full_scale_v = np.array([abs(s.range_si * s.volts_per_si) for s in rig.sensors])
+        self._clipping_v = np.array(
+            [abs(s.clipping_level_si * s.volts_per_si) for s in rig.sensors]
+        )
         self._command_row = rig.channels.index(self.wiring.command)
         self._pending_v = np.empty((len(rig.channels), 0))  # volts not delivered yet
         self._tare: dict[str, float] = {}
@@ -404,7 +405,7 @@ class _ExternalSession:
         values = volts_to_si(volts, rig.sensors, self._tare)
         block = Block("meas", self.delivered, self.rate_hz, rig.channels, values, *labels)
         self.delivered = block.end
-        return block, np.abs(volts) >= CLIP_RATIO * self._full_scale_v[:, None]
+        return block, np.abs(volts) >= self._clipping_v[:, None]
 
     def check_block(self, block: Block, clipped: Bool2D) -> None:
         """Apply protection and loop check to a block, and log the start of the sweep."""

@@ -68,7 +68,6 @@ TARE_S = 1.0
 MAX_FEEDBACK_TRIES = 5
 MAX_QUIET_S = 2.0  # of blocks that are acquired at once
 COMMAND_DELAY_S = 0.1  # extra margin for hold and resume, which are not urgent
-CLIP_RATIO = 0.999  # of a sensor's range; a sample at or above it is clipped
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +185,9 @@ class _Session:
         self.output_queue = OutputQueue(backend, clock, setup.rig.output, self._state.drive, block)
         self.verdict, self.reason = "complete", "the whole drive was played"
         self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
-        self._full_scale_v = np.array([abs(s.range_si * s.volts_per_si) for s in setup.rig.sensors])
+        self._clipping_v = np.array(
+            [abs(s.clipping_level_si * s.volts_per_si) for s in setup.rig.sensors]
+        )
         self.event_log = EventLog(lambda: self.output_queue.acquired)
         self._answered_end = 0  # up to here blocks are answered one by one
 
@@ -238,7 +239,7 @@ class _Session:
         values = volts_to_si(volts, rig.sensors, tare)
         self.output_queue.acquired += count
         block = Block("meas", first, self.rate_hz, rig.channels, values, *labels)
-        clipped = np.abs(volts) >= CLIP_RATIO * self._full_scale_v[:, None]
+        clipped = np.abs(volts) >= self._clipping_v[:, None]
         observation = protection.Observation.from_drive(block, clipped, self.output_queue.drive)
         self._protection, findings = protection.inspect_samples(self._protection, observation)
         return block, clipped, findings

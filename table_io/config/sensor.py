@@ -40,6 +40,7 @@ from table_io.config.base import (
 from table_io.errors import InputError
 from table_io.units import UNITS
 
+CLIP_RATIO = 0.999  # of a sensor's range, from which a sample counts as clipped
 MAX_YEAR = 9999  # of a four-digit ISO date
 
 
@@ -165,6 +166,11 @@ class SensorConfig(ConfigModel):
     @property
     def range_si(self) -> float:
         return self.range * self.si_per_unit
+
+    @property
+    def clipping_level_si(self) -> float:
+        """Level in SI from which a sample counts as clipped, just below the end of the range."""
+        return CLIP_RATIO * self.range_si
 
     @property
     def noise_si(self) -> float:

@@ -13,6 +13,7 @@ from table_io.config.excitation.drive_file import DRIVE_KEY, DRIVE_REMEDY
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.config.sensor import CLIP_RATIO
 from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.orbit_feedback import MAX_COMMAND_RATIO
 from table_io.control.table_response import evaluate_gain
@@ -352,7 +353,7 @@ def _suggest_level(rows: tuple[StepDemand, ...], profile: Profile, rig: RigConfi
     history = [row for row in rows if math.isnan(row.frequency_hz)]
     bounds = [(limit.demand, limit.allowed) for limit in list_limits(rig)]
     bounds += [
-        (TABLE_SENSORS[sensor.channel], sensor.range_si)
+        (TABLE_SENSORS[sensor.channel], sensor.clipping_level_si)
         for sensor in rig.sensors
         if sensor.channel in TABLE_SENSORS
     ]
@@ -411,14 +412,14 @@ def _find_clipped_sensors(rows: tuple[StepDemand, ...], rig: RigConfig) -> list[
         if sensor.channel not in TABLE_SENSORS:
             continue
         worst = max(rows, key=TABLE_SENSORS[sensor.channel])
-        peak = TABLE_SENSORS[sensor.channel](worst) / sensor.si_per_unit
-        if peak > sensor.range:
+        peak = TABLE_SENSORS[sensor.channel](worst)
+        if peak >= sensor.clipping_level_si:
             faults.append(
                 InputError(
-                    f"{peak:.4g} {sensor.unit}",
+                    f"{peak / sensor.si_per_unit:.4g} {sensor.unit}",
                     where=worst.name,
                     key=sensor.channel,
-                    allowed=f"at most its range, {sensor.range:g} {sensor.unit}",
+                    allowed=f"below {CLIP_RATIO:g} of its range, {sensor.range:g} {sensor.unit}",
                     remedy="lower the level, or use a sensor with a larger range",
                 )
             )

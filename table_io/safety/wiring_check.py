@@ -26,7 +26,7 @@ import numpy as np
 from table_io.block import Float1D, Float2D, finite_mean, finite_std
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.config.rig import RigConfig
-from table_io.config.sensor import SensorConfig
+from table_io.config.sensor import CLIP_RATIO, SensorConfig
 
 LineVerdict = Literal["pass", "fail", "not tested"]
 
@@ -178,7 +178,6 @@ def _count_changes(levels: LevelSamples) -> int:
 
 
 MAX_LOST_PERCENT = 0.0  # of the samples
-RAIL_RATIO = 0.999  # of the range
 MAX_STUCK_S = 0.25  # of equal samples, if the noise is at least half a step
 NOISE_RATIO_RANGE = (0.25, 2.0)  # of the noise stated in the rig file
 MIN_BITS = 8.0  # effective bits
@@ -256,7 +255,7 @@ def _check_delivery(resting: RestingInputs, row: int, sensor: SensorConfig) -> I
         "lost samples", sensor.channel, lost_percent, (0.0, MAX_LOST_PERCENT), "%", remedy
     )
     if not resting.is_lost[row]:
-        railed_percent = 100.0 * float(np.mean(np.abs(values) >= RAIL_RATIO * sensor.range))
+        railed_percent = 100.0 * float(np.mean(np.abs(values) >= CLIP_RATIO * sensor.range))
         remedy = "it saturates: check its cable, supply, mounting position and range"
         yield check_value("at the rail", sensor.channel, railed_percent, (0.0, 0.0), "%", remedy)
 

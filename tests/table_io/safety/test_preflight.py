@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from table_io.block import Float1D, Label
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.config.sensor import CLIP_RATIO
 from table_io.errors import InputError
 from table_io.excitation.drive import Correction, Drive, HistorySegment, Segment
 from table_io.excitation.trajectory import plan_excitation, plan_sweep
@@ -316,18 +317,18 @@ def test_demand_at_its_limit_is_allowed_and_beyond_it_refused(
 )
 @given(value=st.floats(1e-3, 0.05))
 @LAW
-def test_sensor_of_the_table_may_be_used_up_to_its_range(
+def test_sensor_of_the_table_may_be_used_up_to_where_it_counts_as_clipped(
     channel: str, demand: str, si_per_unit: float, value: float
 ) -> None:
     """What the specimen does to its sensors is not known before the test."""
     row = set_demand(SMALL, demand, value)
-    full = value / si_per_unit
+    full = value / si_per_unit / CLIP_RATIO * (1 + 1e-12)
     mass = {"mass_disp_m": {"range": 1e-3}, "mass_acc_m_s2": {"range": 1e-3}}
     assert list_faults((SMALL, row), change_rig(sensors={channel: {"range": full}, **mass})) == ()
-    rig = change_rig(sensors={channel: {"range": full * (1 - 1e-12)}})
+    rig = change_rig(sensors={channel: {"range": full * (1 - 2e-12)}})
     (fault,) = list_faults((SMALL, row, SMALL), rig)
     assert (fault.key, fault.where) == (channel, row.name)
-    assert read_number(fault) == pytest.approx(full, rel=1e-3)
+    assert read_number(fault) == pytest.approx(value / si_per_unit, rel=1e-3)
 
 
 @pytest.mark.parametrize("least_lsb", [7, 20])
@@ -426,8 +427,12 @@ def test_history_beyond_a_limit_is_refused_with_the_level_that_fits(
         ("velocity_m_s", 0.5, {}),
         ("acceleration_m_s2", GRAVITY_M_S2, {}),
         ("force_n", 30e3, {}),
-        ("displacement_m", 0.04, {"table_disp_m": 40.0, "mass_disp_m": 1.0}),
-        ("acceleration_m_s2", 0.3 * GRAVITY_M_S2, {"table_acc_m_s2": 0.3, "mass_acc_m_s2": 0.1}),
+        ("displacement_m", 0.04 * CLIP_RATIO, {"table_disp_m": 40.0, "mass_disp_m": 1.0}),
+        (
+            "acceleration_m_s2",
+            0.3 * CLIP_RATIO * GRAVITY_M_S2,
+            {"table_acc_m_s2": 0.3, "mass_acc_m_s2": 0.1},
+        ),
     ],
 )
 @given(excess=st.floats(1.01, 1e3), level=st.floats(1e-3, 10.0), has_points=st.booleans())
