@@ -302,7 +302,7 @@ def _find_clipped(name: str, values: Float1D) -> list[Span]:
 def _list_flat_tops(x: Float1D, depth: Float1D, least_height: float = 0.0) -> list[Span]:
     """Return the parts of a signal where its depth below an extreme is 0, if it is cut off there.
 
-    `least_height`: of what is cut off, by the speeds before and after it.
+    `least_height`: of what is cut off, a parabola with the speeds before and after it.
     """
     levels = np.unique(depth)
     runs = find_stretches(depth == 0.0)
@@ -322,13 +322,10 @@ def _list_flat_tops(x: Float1D, depth: Float1D, least_height: float = 0.0) -> li
     if not parts.size:
         return []
     first, end = parts.T
-    # Of parabolas as long as each part, with the speeds at its ends.
     speeds = np.sort(np.abs([x[first - 1] - x[first - 2], x[end + 1] - x[end]]), axis=0)
     lowest, highest = np.median(0.25 * (end - first) * speeds, axis=1)
-    if usual == 1:  # the peaks of a fine channel are flat where they are rounded
-        step = np.abs(np.diff(x))
-        rounding = np.median(1.0 + 0.5 * (end - first)) * step[step > 0.0].min()
-        least_height = max(least_height, float(rounding))
+    if usual == 1 and not least_height:  # peaks of a fine channel are flat where they are rounded
+        least_height = np.diff(levels).min() * np.median(1.0 + 0.5 * (end - first))
     return inner if least_height <= lowest and highest <= MAX_OVERSHOOT * np.ptp(x) else []
 
 
