@@ -30,7 +30,9 @@ from twin.earthquakes.table_identification import (
 )
 from twin.earthquakes.table_model import TableModel
 from twin.earthquakes.table_response import (
+    ESTIMATED_FRICTION,
     FRICTION_TERMS,
+    LAST_LAG_S,
     STRUCTURES,
     BandProjection,
     PredictiveModel,
@@ -57,6 +59,7 @@ PART_COUNT = 4  # of a single log, that are left out in turn
 PIECE_COUNT = 4  # of each of them, whose scatter says how sure a gain is
 MIN_CORRELATION = 0.7  # of channels of one motion, by size: less says nothing of sign and lag
 MAX_LAG_S, SEARCHED_LAG_S = 0.5, 5.0  # of a slow table, and of a log on two clocks
+ESTIMATE_ROUNDS = 3  # of the friction at the estimated speed, after which it moves no more
 GAIN_LIMITS = 0.2, 5.0  # of displacement over command
 ACCELEROMETER_LIMITS = 0.7, 1.4  # of acceleration over the derivative of the displacement
 ACCELEROMETER_BAND_HZ = 0.8, 5.0  # where both are usually well above their noise
@@ -418,18 +421,28 @@ def estimate_with_channels(
 
     On the judging data, or without any on parts of the fitted one that were left out. These
     channels are measurements of the motion itself, so that this is no prediction: it says how much
-    of what a twin leaves is the reaction of what stands on the table. None without such channels.
+    of what a twin leaves is the reaction of what stands on the table. Other than the command, they
+    follow the motion as well as precede it, so that the lags have both signs, and they give the
+    speed on which the friction acts, in ESTIMATE_ROUNDS. None without such channels.
     """
     names = set.intersection(*(set(log.channels) for log in (*data, *judges)))
     if not names:
         return None
     channels = tuple(sorted(names))
-    structure = ResponseStructure("estimate", "with channels", (*FRICTION_TERMS, *channels))
-    regression = ResponseRegression.from_data(structure, data, find_delay(data))
-    left = [regression.leave(log) for log in judges] if judges else regression.held_out
+    terms: tuple[str, ...] = (*FRICTION_TERMS, *channels)
+    delay_s = find_delay(data)
+    for _ in range(ESTIMATE_ROUNDS):
+        structure = ResponseStructure("estimate", "with channels", terms, first_lag_s=-LAST_LAG_S)
+        regression = ResponseRegression.from_data(structure, data, delay_s)
+        held_out, left = regression.held_out, [regression.leave(log) for log in judges]
+        data, judges = (
+            [log.add_estimated_friction(own, delay_s) for log, own in zip(logs, rest, strict=True)]
+            for logs, rest in ((data, held_out), (judges, left))
+        )
+        terms = (*FRICTION_TERMS, *ESTIMATED_FRICTION, *channels)
     errors = (
         _round_error(float(np.linalg.norm(rest) / np.linalg.norm(log.measured)))
-        for rest, log in zip(left, judges or data, strict=True)
+        for rest, log in zip(left or held_out, judges or data, strict=True)
     )
     return ChannelEstimate(channels=channels, errors=tuple(errors))
 

@@ -14,7 +14,7 @@ twin of it holds for that specimen.
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -48,6 +48,7 @@ TERMS: dict[str, Callable[[Float1D, Float1D], Float1D]] = {
     "friction_20_mm_s": lambda speed, acceleration: np.tanh(speed / 2e-2),
 }
 FRICTION_TERMS = tuple(TERMS)
+ESTIMATED_FRICTION = tuple(f"estimated_{name}" for name in FRICTION_TERMS[1:])
 CROSSOVER_HZ = 1.5  # below: displacement; above: acceleration
 
 
@@ -60,6 +61,7 @@ class ResponseStructure:
     terms: tuple[str, ...] = ()
     has_lags: bool = True
     has_resonance: bool = False
+    first_lag_s: float = FIRST_LAG_S
 
 
 # From the simplest to the richest; the first three are the baselines of a judgement.
@@ -205,14 +207,26 @@ class BandProjection:
 
     def to_rows(self, spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.float64]:
         """Return signals in time, (..., row), from their spectra in the band, (..., frequency)."""
-        duration_s = self.size / self.rate_hz
-        size = 2 * math.ceil(0.5 * ROWS_PER_PERIOD * self.band_hz[1] * duration_s)
+        size = self._row_count
         whole = np.zeros((*spectrum.shape[:-1], size // 2 + 1), complex)
         first = int(np.flatnonzero(self.used)[0])
         whole[..., first : first + spectrum.shape[-1]] = spectrum
         rows = np.fft.irfft(whole, size) * size / self.size
         kept: npt.NDArray[np.float64] = rows[..., : round(size * self.count / self.size)]
         return kept
+
+    @property
+    def _row_count(self) -> int:
+        """Rows of a log with its padding, even."""
+        duration_s = self.size / self.rate_hz
+        return 2 * math.ceil(0.5 * ROWS_PER_PERIOD * self.band_hz[1] * duration_s)
+
+    def to_spectrum(self, rows: Float1D) -> Complex1D:
+        """Return the spectrum in the band, (frequency,), of a signal that ends at rest, (row,)."""
+        first, size = int(np.flatnonzero(self.used)[0]), self._row_count
+        spectrum = np.fft.rfft(rows, size)[first : first + self.frequency_hz.size]
+        scaled: Complex1D = spectrum * self.size / size
+        return scaled
 
     def to_samples(self, spectrum: Complex1D) -> Float1D:
         """Return a signal, (sample,), from its spectrum in the band, (frequency,)."""
@@ -281,6 +295,21 @@ class ResponseData:
         late = np.exp(-2j * math.pi * self.projection.frequency_hz * delay_s)
         return self.projection.to_rows(self.command_spectrum * late)
 
+    def add_estimated_friction(self, left: Float1D, delay_s: float) -> "ResponseData":
+        """Return the log with the friction of its measured motion less `left`, (row,), as channels.
+
+        Friction acts on the speed of the table, of which that of the command is a first guess.
+        """
+        projection = self.projection
+        change = projection.to_spectrum(self.measured - left - self.delay_command(delay_s))
+        jw = 2j * math.pi * projection.frequency_hz
+        moved_m = self.command_m + projection.to_samples(change * np.exp(jw * delay_s) / jw**2)
+        extended = extend_motion(moved_m, projection.rate_hz)
+        spectra = compute_terms(extended, projection.rate_hz, FRICTION_TERMS[1:])
+        rows = (np.fft.irfft(row, extended.size)[: moved_m.size] for row in spectra.values())
+        friction = dict(zip(ESTIMATED_FRICTION, rows, strict=True))
+        return replace(self, channels={**self.channels, **friction})
+
     def compute_columns(
         self,
         terms: Sequence[str],
@@ -323,8 +352,8 @@ def list_lags(structure: ResponseStructure, band_hz: tuple[float, float]) -> tup
     """Return the lags of a structure in s, that resolve its band."""
     if not structure.terms or not structure.has_lags:
         return (0.0,)
-    count = math.ceil((LAST_LAG_S - FIRST_LAG_S) * LAGS_PER_PERIOD * band_hz[1])
-    return tuple(np.linspace(FIRST_LAG_S, LAST_LAG_S, count).tolist())
+    count = math.ceil((LAST_LAG_S - structure.first_lag_s) * LAGS_PER_PERIOD * band_hz[1])
+    return tuple(np.linspace(structure.first_lag_s, LAST_LAG_S, count).tolist())
 
 
 @dataclass(frozen=True, eq=False)
