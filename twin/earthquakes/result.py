@@ -99,6 +99,12 @@ class EffectVerdict(ConfigModel):
     outcome: str = Field(description="none, named, ambiguous or unexplained.")
     probability: NonNegative = Field(description="Probability of the outcome.")
     place: str = Field("", description="Place of what no effect explains.")
+    effects: tuple[str, ...] = Field(
+        (), description="Effects of the verdict, also those that the twin predicts better without."
+    )
+    alternatives: tuple[tuple[str, ...], ...] = Field(
+        (), description="Sets of effects that cannot be told apart from these."
+    )
 
 
 class TableTwinReport(ConfigModel):
@@ -246,6 +252,8 @@ class TableTwinResult:
                 outcome=verdict.outcome,
                 probability=float(f"{verdict.confidence:.4g}"),
                 place=verdict.place,
+                effects=verdict.best.names,
+                alternatives=tuple(other.names for other in verdict.alternatives),
             ).model_dump()
         text["judgement"] = self.judgement.model_dump(exclude_none=True)
         text["provenance"] = self.provenance.model_dump()
