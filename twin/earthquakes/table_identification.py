@@ -17,7 +17,7 @@ from scipy import optimize, stats
 
 from table_io.block import Float1D, Float2D, Int1D
 from table_io.errors import InputError
-from twin.earthquakes.table_model import TableModel, TableParameters
+from twin.earthquakes.table_model import MAX_STEP_S, TableModel, TableParameters
 from twin.earthquakes.table_response import CROSSOVER_HZ
 from twin.system.process_pool import map_in_threads
 
@@ -63,6 +63,7 @@ STARTING_FRAMES_HZ = 5.0, 40.0, 24  # first, last, number
 MAX_FRAMES = 2  # a mode of the oil column may look like a frame
 ROUGH_EVALUATIONS = 6  # of the fits that only lead to a start
 ROUGH_SHARE = 0.3  # of the energy of the motion, on which those fits look: up to that moment
+ROUGH_STEP_S = 5e-4  # of the integrator in those fits, whose values are only a start
 VALVE_DAMPING = 0.8, 0.2  # mean and standard deviation before the rehearsal: data sheets
 NO_BLOCK = -1
 LENGTH_STEP = 100  # samples, of which a rehearsal is a multiple
@@ -123,6 +124,7 @@ class RehearsalProblem:
     measured: npt.NDArray[np.complex128]  # (frequency used,), weighted
     block: Int1D  # of each residual, (residual,); NO_BLOCK for the last one
     noise: float
+    max_step_s: float = MAX_STEP_S  # of the integrator
 
     @classmethod
     def from_rehearsal(
@@ -166,13 +168,14 @@ class RehearsalProblem:
         energy = np.cumsum(self.motion.acceleration_m_s2**2)
         count = int(np.searchsorted(energy, ROUGH_SHARE * energy[-1])) + LENGTH_STEP
         count = max(count, math.ceil(MIN_DURATION_S * self.motion.rate_hz) + LENGTH_STEP)
-        return self.from_rehearsal(self.motion.cut(count), self.mass_kg, self.stall_force_n)
+        beginning = self.from_rehearsal(self.motion.cut(count), self.mass_kg, self.stall_force_n)
+        return replace(beginning, max_step_s=ROUGH_STEP_S)
 
     def compute_residuals(self, parameters: TableParameters) -> Float1D:
         """Return the residuals of a twin of the table, (residual,)."""
         motion = self.motion
         model = TableModel(self.mass_kg, parameters)
-        out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n)
+        out = model.simulate(motion.command_m, motion.rate_hz, motion.reaction_n, self.max_step_s)
         if not np.isfinite(out).all():
             return np.full(self.block.size, 10.0)
         all_hz = np.fft.rfftfreq(motion.command_m.size, 1.0 / motion.rate_hz)

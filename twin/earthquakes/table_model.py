@@ -260,7 +260,11 @@ class TableModel:
         return self.parameters.delay_s
 
     def simulate(
-        self, command_m: Float1D, rate_hz: float, reaction_n: Float1D | None = None
+        self,
+        command_m: Float1D,
+        rate_hz: float,
+        reaction_n: Float1D | None = None,
+        max_step_s: float = MAX_STEP_S,
     ) -> Float2D:
         """Return table displacement in m and acceleration in m/s2, (2, sample), from rest.
 
@@ -268,7 +272,7 @@ class TableModel:
         """
         reaction = np.zeros(command_m.size) if reaction_n is None else reaction_n
         out = np.empty((2, command_m.size))
-        steps = math.ceil(1.0 / (rate_hz * MAX_STEP_S))
+        steps = math.ceil(1.0 / (rate_hz * max_step_s))
         _simulate(
             np.ascontiguousarray(command_m), np.ascontiguousarray(reaction), self.mass_kg,
             rate_hz, steps, self.parameters, out,
