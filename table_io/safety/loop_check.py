@@ -339,7 +339,9 @@ def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
         return factor * math.hypot(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
 
     faults = [
-        f"noise of {name} is {value:.3g} {unit} in a short rest by the rig file, allowed "
+        f"noise of {name} is {value:.3g} {unit} "
+        + ("below the level " if unit == "dB" else "")
+        + "in a short rest by the rig file, allowed "
         + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
         + f" {unit}"
         for name, value, low, high, unit in list_noise_margins(
