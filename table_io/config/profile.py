@@ -412,18 +412,6 @@ class Profile(ConfigModel):
             )
         return resume
 
-    @field_validator("acquisition")
-    @classmethod
-    def _check_rate(cls, acquisition: AcquisitionConfig, info: ValidationInfo) -> AcquisitionConfig:
-        sweep = info.data.get("excitation")
-        if isinstance(sweep, Sweep) and acquisition.rate_hz < 100 * sweep.stop_hz:
-            raise InputError(
-                f"rate_hz {acquisition.rate_hz:g} gives fewer than 100 samples per cycle at "
-                f"sweep.stop_hz {sweep.stop_hz:g}",
-                allowed=f"at least {100 * sweep.stop_hz:g}",
-            )
-        return acquisition
-
 
 def load_profile(path: Path) -> tuple[Profile, str]:
     """Load a test profile and the files that it names: return (profile, text with the files).

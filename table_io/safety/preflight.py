@@ -332,9 +332,19 @@ def _find_rate_faults(profile: Profile, rig: RigConfig) -> list[InputError]:
                 allowed=rates,
             )
         )
+    per_cycle, high_hz = profile.excitation.MIN_SAMPLES_PER_CYCLE, profile.plan.high_hz
+    if profile.acquisition.rate_hz < per_cycle * high_hz:
+        faults.append(
+            InputError(
+                f"{profile.acquisition.rate_hz:g} Hz gives fewer than {per_cycle:g} samples per "
+                f"cycle at the highest frequency, {high_hz:g} Hz",
+                key="acquisition.rate_hz",
+                allowed=f"at least {per_cycle * high_hz:g}",
+            )
+        )
     max_hz = rig.limits.frequency_hz
     top_key = "sweep.stop_hz" if profile.steps else "upper end of the excitation's band"
-    requested_hz = {top_key: profile.plan.high_hz}
+    requested_hz = {top_key: high_hz}
     if profile.loop_check.enabled and profile.loop_check.frequencies_hz:
         requested_hz["loop_check.frequencies_hz"] = max(profile.loop_check.frequencies_hz)
     faults += [

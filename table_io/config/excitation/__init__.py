@@ -76,6 +76,7 @@ class Excitation(ConfigModel):
     kind: str = Field(DEFAULT_KIND, description="What is played; it decides the other keys.")
     FILE_KEYS: ClassVar[tuple[str, ...]] = ()
     LEVEL_KEY: ClassVar[str] = ""  # key that a too large motion is reduced with, in proportion
+    MIN_SAMPLES_PER_CYCLE: ClassVar[float] = 0.0  # to play it, at the highest frequency
 
     @classmethod
     def convert_file(cls, data: bytes, name: str, table: Mapping[str, Any]) -> dict[str, str]:

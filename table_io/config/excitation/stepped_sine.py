@@ -5,7 +5,7 @@ sweep, from the lowest level to the full one, say. The table [sweep] of a profil
 its older name.
 """
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator
@@ -29,6 +29,8 @@ MIN_LEVEL_DB, MAX_LEVEL_DB = -60.0, 20.0  # of a schedule
 @register_excitation("stepped_sine")
 class Sweep(Excitation):
     """Stepped sine sweep of stated peak table acceleration, up and down one frequency grid."""
+
+    MIN_SAMPLES_PER_CYCLE: ClassVar[float] = 100.0
 
     start_hz: float = Field(ge=0.01, allow_inf_nan=False, description="Lowest frequency.")
     stop_hz: Positive = Field(description="Highest frequency.")

@@ -18,6 +18,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.errors import InputError
 from table_io.records import Event, SweepLevel, Trip
+from table_io.safety.preflight import check_limits, compute_demands
 from tests.builders.profiles import make_history_profile
 from tests.builders.rigs import SECOND_ACC, TEMPERATURE, make_faulty_rig, make_lab_rig, read_rig
 from tests.builders.sessions import PlayedSession, play_session
@@ -364,7 +365,7 @@ def find_hold(played: PlayedSession) -> tuple[int, int]:
 
 
 def test_refusals_of_a_swept_sine_name_the_key() -> None:
-    from table_io.sequencer.procedure import make_test_plan
+    from table_io.sequencer.procedure import make_test_plan, nominal_drive
 
     notch = {"channel": "table_acc_m_s2", "limit": 1.0, "action": "notch"}
     with pytest.raises(ValueError, match="notch"):
@@ -381,9 +382,11 @@ def test_refusals_of_a_swept_sine_name_the_key() -> None:
         make_test_plan(make_swept_profile(control_channels=["specimen_acc_top_m_s2"]), rig)
     with pytest.raises(InputError, match="response_channel"):
         make_test_plan(make_swept_profile(response_channel="mass_acc_m_s"), rig)
+    fast = make_swept_profile(stop_hz=100.0)
+    demands = compute_demands(nominal_drive(make_test_plan(fast, rig)), fast, rig)
+    with pytest.raises(InputError, match="fewer than 20 samples per cycle"):
+        check_limits(demands, fast, rig, "test")
     with pytest.raises(ValueError, match=r"the passes take .* h"):
         make_swept_profile(octaves_per_min=1e-6)
     with pytest.raises(InputError, match=r"write \[\[limits\]\]"):
         parse_toml('[limits]\nchannel = "table_acc_m_s2"\nlimit = 1.0', Profile, "test")
-    with pytest.raises(InputError, match="samples per cycle"):
-        _ = make_swept_profile(stop_hz=100.0).plan

@@ -96,7 +96,6 @@ REFUSALS: list[tuple[str, Any, str, dict[str, Any]]] = [
      "specimen.gap_mm", {"allowed": "a number in mm, or inf for no bumpers"}),
     ("sweep", {"specimen__gap_right_mm": 2.0}, "specimen.gap_left_mm", {}),
     ("sweep", {"specimen__gap_left_mm": 2.0}, "specimen.gap_left_mm", {}),
-    ("sweep", {"acquisition__rate_hz": 499.0}, "acquisition", {"allowed": "at least 500"}),
     ("sweep", {"sweep": 3}, "sweep", {"value": 3}),
     ("rig", ('"mass_acc_m_s2"', '"mass_acc_m_s"'),
      "sensors.4.channel", {"remedy": "did you mean 'mass_acc_m_s2'? or declare it"}),

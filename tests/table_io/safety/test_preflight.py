@@ -371,6 +371,17 @@ def test_highest_frequency_of_sweep_and_loop_check(
     assert [(fault.key, fault.value) for fault in faults] == keys
 
 
+@pytest.mark.parametrize(
+    ("rate_hz", "faults"),
+    [(1000.0, []), (float(np.nextafter(1000.0, 0.0)), [("acquisition.rate_hz", "at least 1000")])],
+)
+def test_samples_per_cycle_of_what_is_played(rate_hz: float, faults: list[tuple[str, str]]) -> None:
+    """A file that is imported may have fewer: only a motion is refused."""
+    test = make_test(acquisition={"rate_hz": rate_hz})
+    found = list_faults((SMALL,), RIG.model_copy(update={"rates_hz": (rate_hz,)}), test)
+    assert [(fault.key, fault.allowed) for fault in found] == faults
+
+
 @pytest.mark.parametrize("key", ["piston_area_cm2", "peak_flow_l_min"])
 def test_flow_without_its_area_is_no_limit(key: str) -> None:
     with pytest.raises(ValueError, match="go together"):
