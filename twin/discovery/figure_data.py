@@ -6,7 +6,7 @@ cross-validation residuals.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -89,12 +89,22 @@ class DiscoveryView:
         return self._list_samples(fitted)[log].evaluate(fitted.fit.parameters)
 
     def _list_samples(self, fitted: FittedSet) -> tuple[LogResiduals, ...]:
-        """Return the residuals at the samples, less the instrument errors fitted with a set."""
+        """Return the residuals at the samples, less the instrument errors fitted with a set.
+
+        The samples of a row are those of the best set: contacts that the displacement shows move
+        with the instrument errors.
+        """
         known = self._sample_cache.get(fitted)
         if known is None:
             parameters = fitted.fit.parameters
             problem = self.discovery.prepared.problem
             known = tuple(resolve_samples(each, parameters) for each in problem.log_residuals)
+            if fitted is not self._best:
+                best = self.log_residuals
+                known = tuple(
+                    replace(each, fixed_mask=drawn.row_mask)
+                    for each, drawn in zip(known, best, strict=True)
+                )
             self._sample_cache[fitted] = known
         return known
 
