@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from tests.discovery.played import (
     ACC_GAIN,
     CELL_SHARE,
@@ -25,6 +26,8 @@ from twin.discovery.discover import (
     prepare_problem,
 )
 from twin.discovery.nuisances import (
+    ACCELEROMETERS,
+    LASERS,
     MAX_SIZE,
     TYPICAL_GAIN,
     TYPICAL_SHARE,
@@ -34,8 +37,9 @@ from twin.discovery.nuisances import (
     list_nuisances,
     sensor_mask,
 )
-from twin.discovery.parameters import DAMPING, STIFFNESS, NuisanceKey
-from twin.discovery.residuals import Nuisance
+from twin.discovery.parameters import DAMPING, STIFFNESS, NuisanceKey, ParameterSet
+from twin.discovery.residuals import Nuisance, build_log_residuals
+from twin.discovery.signals import LogSignals
 
 
 @cache
@@ -46,6 +50,15 @@ def explain_imperfect_log() -> PreparedProblem:
 @cache
 def prepare_quiet_log() -> PreparedProblem:
     return prepare_problem([log(noise=0.2)], SNM)
+
+
+def without_cells(acc_noise: float = 1.0, laser_noise: float = 1.0) -> LogSignals:
+    """Return signals without load cells, with noise of the sensors changed by factors."""
+    signals = log(noise=0.2).signals
+    spectra = {k: v for k, v in signals.spectra.items() if k not in (*RIGHT_CELLS, *LEFT_CELLS)}
+    factors = dict.fromkeys(ACCELEROMETERS, acc_noise) | dict.fromkeys(LASERS, laser_noise)
+    noise = {k: v * factors.get(k, 1.0) for k, v in signals.noise.items()}
+    return replace(signals, spectra=spectra, noise=noise)
 
 
 def nuisance_values(prepared: PreparedProblem) -> Mapping[NuisanceKey, float]:
@@ -132,6 +145,38 @@ def test_a_column_is_the_effect_of_its_nuisance(kind_and_place: tuple[str, str])
     change = bare.evaluate_rows(parameters, corrected.fuse_motion()) - before
     difference = change - terms.columns[number]
     assert math.sqrt(np.mean(difference**2)) < 0.2 * math.sqrt(np.mean(change**2))
+
+
+@pytest.mark.parametrize("place", ["table_disp_m", "mass_acc_m_s2"])
+def test_a_column_does_not_hang_on_what_the_model_lacks(place: str) -> None:
+    """Without load cells the forces of the bumpers follow the motion that was measured.
+
+    A motion that obeys the model instead would touch them elsewhere.
+    """
+    (bare,) = build_log_residuals([(without_cells(acc_noise=0.03), 0.0)], SNM)
+    true = ParameterSet.from_model(SNM, 1)
+    soft = true.with_values({STIFFNESS: 0.7 * true.values[STIFFNESS]})
+    columns = []
+    for parameters in (true, soft):
+        terms = linearize_nuisances(bare, parameters).nuisances
+        assert terms is not None
+        number = [(each.kind, each.place) for each in terms.nuisances].index(("gain", place))
+        columns.append(terms.columns[number][bare.entry_row[: terms.columns.shape[1]] == 0])
+    of_true, of_soft = columns
+    assert of_soft @ of_true > 0.9 * math.sqrt((of_true @ of_true) * (of_soft @ of_soft))
+
+
+def test_noise_without_load_cells_is_that_of_what_is_touched() -> None:
+    """A bumper that is 15 times as stiff as the damper makes so much more of the noise of u."""
+    (bare,) = build_log_residuals([(without_cells(laser_noise=30.0), 0.0)], SNM)
+    parameters = ParameterSet.from_model(SNM, 1)
+    noise = bare.noise_copy.evaluate(parameters) - bare.evaluate(parameters)
+    m, in_row = bare.motion(), bare.entry_row == 0
+    depth = np.abs(m.u[bare.entry_sample]) - SNM.parameters.gap_r
+    parts = in_row & (depth > 0.0), in_row & (depth < 0.0)
+    assert all(part.sum() > 1000 for part in parts)
+    touched, free = (math.sqrt(np.mean(noise[part] ** 2)) for part in parts)
+    assert touched == pytest.approx(free, rel=0.1)
 
 
 def test_a_prior_holds_every_nuisance() -> None:

@@ -83,6 +83,33 @@ class MeasuredMotion:
         moving: Bool2D = self.good & (self.label != Label.REST)
         return moving
 
+    def move(self, start: "MeasuredMotion", end: "MeasuredMotion") -> "MeasuredMotion":
+        """Return the motion moved by the change from one motion of the test to another."""
+
+        def add_change(own: Float1D, before: Float1D, after: Float1D) -> Float1D:
+            return own + (after - before)
+
+        residuals = zip(
+            self.consistency_residuals, start.consistency_residuals, end.consistency_residuals,
+            strict=True,
+        )  # fmt: skip
+        damper = self.damper
+        if damper is not None and start.damper is not None and end.damper is not None:
+            damper = add_change(damper, start.damper, end.damper)
+        return replace(
+            self, gaps_m=end.gaps_m, damper=damper,
+            consistency_residuals=tuple(
+                replace(own, values=add_change(own.values, before.values, after.values))
+                for own, before, after in residuals
+            ),
+            u=add_change(self.u, start.u, end.u), v=add_change(self.v, start.v, end.v),
+            acc=add_change(self.acc, start.acc, end.acc),
+            table_acc=add_change(self.table_acc, start.table_acc, end.table_acc),
+            table_disp=add_change(self.table_disp, start.table_disp, end.table_disp),
+            right=add_change(self.right, start.right, end.right),
+            left=add_change(self.left, start.left, end.left),
+        )  # fmt: skip
+
     def select(self, samples: Int1D) -> "MeasuredMotion":
         """Return the motion at these samples alone, without its consistency residuals."""
         return replace(

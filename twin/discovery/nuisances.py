@@ -38,7 +38,6 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.discovery.signals import SENSOR_PAIRS, LogSignals, pass_motion, weigh_sensors
-from twin.model.inverse_dynamics import forces_along
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
 LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
@@ -211,12 +210,14 @@ def linearize_nuisances(
     if calibrate:
         signals = signals.calibrate_noise()
     bare = replace(residuals.with_signals(signals), nuisances=None)
-    smooth = _smooth_signals(bare, parameters)
-    before = bare.evaluate_rows(parameters, signals.fuse_corrected(smooth))
+    smooth, measured = _smooth_signals(bare, parameters), bare.motion()
+    start = signals.fuse_corrected(smooth)
+    before = bare.evaluate_rows(parameters, measured)
 
     def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
-        corrected = correct_signals(smooth, nuisance, SLOPE_STEP)
-        rows = bare.evaluate_rows(parameters, signals.fuse_corrected(corrected))
+        end = signals.fuse_corrected(correct_signals(smooth, nuisance, SLOPE_STEP))
+        # about the measured motion: only there is it known what touches what
+        rows = bare.evaluate_rows(parameters, measured.move(start, end))
         return ((rows - before) / SLOPE_STEP).astype(np.float32)
 
     kept = [
@@ -281,7 +282,6 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
     """
     signals, m = residuals.signals, residuals.motion()
     spectra, grid = dict(signals.spectra), signals.grid
-    model = parameters.model_for_log(residuals.log_number, m)
     gain = pass_motion(signals, m.u, signals.motion_density)
     u, v = grid.apply_gain(m.u, gain), grid.apply_gain(m.v, gain)
     for laser in spectra.keys() & {*LASERS}:
@@ -289,11 +289,11 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
         spectra[laser] = spectra[laser] * pass_motion(
             signals, grid.to_time_domain(spectra[laser]), density
         )
-    forces = forces_along(model, u, v, m.table_acc, m.time_s, residuals.contact_state)
+    forces = residuals.expect_forces(parameters, replace(m, u=u, v=v))
     damper, right, left = (grid.from_time_domain(np.nan_to_num(force)) for force in forces)
     if "damper_force_n" in spectra:
         spectra["damper_force_n"] = damper
-    for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, -left)):
+    for cells, force in ((RIGHT_CELLS, right), (LEFT_CELLS, left)):
         measured = [spectra[cell] for cell in cells if cell in spectra]
         if not measured:
             continue
@@ -304,7 +304,8 @@ def _smooth_signals(residuals: LogResiduals, parameters: ParameterSet) -> LogSig
                 share = float(np.vdot(total, spectra[cell]).real) / power
                 spectra[cell] = share * force
     if "mass_acc_m_s2" in spectra and "damper_force_n" not in spectra:
-        spectra["mass_acc_m_s2"] = -(damper + right + left) / m.mass_kg
+        total = damper + right - left if m.has_load_cells else damper
+        spectra["mass_acc_m_s2"] = -total / m.mass_kg
     if "table_acc_m_s2" in spectra:
         spectra["table_acc_m_s2"] = _smooth_table_acc(signals)
     return replace(signals, spectra=spectra)

@@ -231,12 +231,7 @@ class LogResiduals:
             for row in range(2):
                 in_contact = self.contact_state[row] > 0
                 used[1 + row] = m.moving & exclude_margins(in_contact, margin, margin)
-        contact = self.contact_state
-        if (contact < 0).any():  # without load cells, as the model expects
-            forces = forces_along(self.reference_for(m), m.u, m.v, m.table_acc, m.time_s, contact)[
-                1:
-            ]
-            contact = np.array([forces[0] > 0, forces[1] < 0], dtype=np.int8)
+        contact = self._expected_contact
         is_steady = (np.diff(contact, axis=1, prepend=contact[:, :1]) == 0).all(axis=0)
         smooth = exclude_margins(is_steady, margin, margin)
         if contact is not self.contact_state:
@@ -251,6 +246,16 @@ class LogResiduals:
                 side = {"right cells": 0, "left cells": 1}.get(name)
                 used[row] = m.moving & smooth if side is None else used[1 + side]
         return used & self._thinning_mask
+
+    @cached_property
+    def _expected_contact(self) -> npt.NDArray[np.int8]:
+        """Contact of right and left, (2, sample), without load cells as the model expects."""
+        contact = self.contact_state
+        if not (contact < 0).any():
+            return contact
+        m = self.motion()
+        forces = forces_along(self.reference_for(m), m.u, m.v, m.table_acc, m.time_s, contact)
+        return np.array([forces[1] > 0, forces[2] < 0], dtype=np.int8)
 
     def reference_for(self, m: MeasuredMotion) -> Model:
         """Return the reference model with the mass and the stated gaps of this log."""
@@ -555,14 +560,31 @@ class LogResiduals:
 
         Without load cells the damper force is the sum of all forces.
         """
+        mass = parameters.model_for_log(self.log_number, m).parameters.mass
+        measured = np.array(self.measured_forces(m, mass, parameters))
+        return measured - self.expect_forces(parameters, m)
+
+    def expect_forces(self, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
+        """Return the modelled damper force, F_R and -F_L on a motion in N, (3, sample).
+
+        Without load cells the damper force is the sum of all forces.
+        """
         model = parameters.model_for_log(self.log_number, m)
         whole = SampledMotion(m, slice(None), m, self.contact_state)
-        return np.array(self._force_errors(model, parameters, whole))
+        return np.array(self._expect_forces(model, parameters, whole))
 
     def _force_errors(
         self, model: Model, parameters: ParameterSet, sampled: SampledMotion
     ) -> tuple[Float1D, Float1D, Float1D]:
         """Return `force_errors` of the model of this log, (used,) each."""
+        measured = self.measured_forces(sampled.m, model.parameters.mass, parameters)
+        d, right, left = self._expect_forces(model, parameters, sampled)
+        return measured[0] - d, measured[1] - right, measured[2] - left
+
+    def _expect_forces(
+        self, model: Model, parameters: ParameterSet, sampled: SampledMotion
+    ) -> tuple[Float1D, Float1D, Float1D]:
+        """Return `expect_forces` of the model of this log, (used,) each."""
         m = sampled.m
         d, right, left = self._model_forces(model, parameters, sampled)
         if SLIP_SPEED in parameters.values:
@@ -574,9 +596,7 @@ class LogResiduals:
         added = model.added_acceleration(m.table_disp)
         if added is not None:
             d = d + model.parameters.mass * added
-        left = -left
-        measured = self.measured_forces(m, model.parameters.mass, parameters)
-        return measured[0] - d, measured[1] - right, measured[2] - left
+        return d, right, -left
 
     def _model_forces(
         self, model: Model, parameters: ParameterSet, sampled: SampledMotion
@@ -822,18 +842,13 @@ class LogResiduals:
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
-        p, signals = self.reference.parameters, self._louder_signals
-        k, c = (
-            (p.stiffness, p.damping),
-            (p.bumper_stiffness_r, p.bumper_damping_r),
-            (p.bumper_stiffness_l, p.bumper_damping_l),
-        )[row]
-        hz = basis.frequency_hz
+        signals, hz = self._louder_signals, basis.frequency_hz
+        stiffness, damping = self._fact_stiffness(row, basis)
 
         def at_facts(density: Float1D) -> Float1D:
             return np.interp(hz, signals.omega / (2 * np.pi), density)
 
-        parts = [at_facts(signals.motion_density) * np.hypot(k, 2 * np.pi * hz * c)]
+        parts = [at_facts(signals.motion_density) * np.hypot(stiffness, 2 * np.pi * hz * damping)]
         readings = dict.fromkeys((RIGHT_CELLS, LEFT_CELLS)[row - 1], 1.0) if row else {}
         if row == 0 and "damper_force_n" in signals.channels:
             readings = {"damper_force_n": 1.0}
@@ -847,6 +862,26 @@ class LogResiduals:
             if name in signals.noise
         ]
         return np.hypot.reduce(parts)
+
+    def _fact_stiffness(self, row: int, basis: BlockBasis) -> tuple[Float1D, Float1D]:
+        """Return K in N/m and C in N s/m of the specimen that a force row has at its facts.
+
+        Without load cells the bumpers are in the row of the damper, and so is what they make of
+        the noise of u.
+        """
+        p = self.reference.parameters
+        elements = np.array([
+            (p.stiffness, p.damping),
+            (p.bumper_stiffness_r, p.bumper_damping_r),
+            (p.bumper_stiffness_l, p.bumper_damping_l),
+        ])  # fmt: skip
+        present = np.zeros((len(elements), basis.size))
+        present[row] = 1.0
+        m = self.motion()
+        if row == 0 and not m.has_load_cells and m.damper is None:
+            present[1:] = self._expected_contact[:, self._row_samples[0][basis.middle]] > 0
+        stiffness, damping = elements.T @ present
+        return stiffness, damping
 
     def enter_forces(self, forces: Float2D) -> Float1D:
         """Return what forces add to the residual if a model has them, (entry,).

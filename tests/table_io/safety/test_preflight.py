@@ -378,8 +378,8 @@ def test_highest_frequency_of_sweep_and_loop_check(
 def test_samples_per_cycle_of_what_is_played(rate_hz: float, faults: list[tuple[str, str]]) -> None:
     """A file that is imported may have fewer: only a motion is refused."""
     test = make_test(acquisition={"rate_hz": rate_hz})
-    found = list_faults((SMALL,), RIG.model_copy(update={"rates_hz": (rate_hz,)}), test)
-    assert [(fault.key, fault.allowed) for fault in found] == faults
+    refusals = list_faults((SMALL,), RIG.model_copy(update={"rates_hz": (rate_hz,)}), test)
+    assert [(fault.key, fault.allowed) for fault in refusals] == faults
 
 
 @pytest.mark.parametrize("key", ["piston_area_cm2", "peak_flow_l_min"])
