@@ -20,6 +20,7 @@ the same motion. `drive_disp_m` is a command, which may be anything: it is judge
 is said to have been played.
 """
 
+import math
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -31,6 +32,7 @@ from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from table_io.block import (
     Block,
     Float1D,
+    Float2D,
     find_stretches,
     interpolate_missing,
     join_with_gaps,
@@ -622,18 +624,30 @@ def _list_drifting(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[
                 columns.append(weight * np.array([1.0 / omega, -omega, -omega * middle_s]))
         if len(phases) < 3:
             continue
-        phase, matrix = np.concatenate(phases), np.concatenate(columns, axis=1).T
-        fits = [np.linalg.lstsq(matrix[:, :count], phase)[0] for count in (2, 3)]
-        steady, left = (float(np.sum((phase - matrix[:, : fit.size] @ fit) ** 2)) for fit in fits)
-        seconds = acc.size / rate_hz
-        if abs(fits[1][2]) * seconds > _max_delay(rate_hz) and left < MAX_PHASE_LEFT * steady:
+        parts = [(y, x.T) for y, x in zip(phases, columns, strict=True)]
+        fit, left = _fit_parts(parts)
+        steady = _fit_parts([(y, x[:, :2]) for y, x in parts])[1]
+        # the lines of a part leak into each other: what counts is how the parts agree
+        others = [_fit_parts([*parts[:k], *parts[k + 1 :]])[0][2] for k in range(len(parts))]
+        error = math.sqrt((len(parts) - 1) * float(np.var(others)))
+        seconds, drift = acc.size / rate_hz, float(fit[2])
+        is_sure = abs(drift) * seconds > _max_delay(rate_hz) + DELAY_SIGMA * error * seconds
+        if is_sure and left < MAX_PHASE_LEFT * steady:
             yield ChannelDoubt(
                 "drifting",
                 (position, *name.split(" - ")),
-                f"{name} and {position} drift apart by {abs(fits[1][2]) * seconds:.2g} s in "
-                f"{seconds:.4g} s: they are of two clocks, {1e6 * abs(fits[1][2]):.2g} ppm apart",
+                f"{name} and {position} drift apart by {abs(drift) * seconds:.2g} s in "
+                f"{seconds:.4g} s: they are of two clocks, {1e6 * abs(drift):.2g} ppm apart",
                 "record both by one clock, or resample the channels of one to the other",
             )
+
+
+def _fit_parts(parts: Sequence[tuple[Float1D, Float2D]]) -> tuple[Float1D, float]:
+    """Return (least squares of all parts, each a vector and a matrix, sum of squares left)."""
+    values = np.concatenate([part for part, _ in parts])
+    matrix = np.concatenate([part for _, part in parts])
+    fit = np.linalg.lstsq(matrix, values)[0]
+    return fit, float(np.sum((values - matrix @ fit) ** 2))
 
 
 def _list_swapped(channels: Mapping[str, Float1D], rate_hz: float) -> Iterator[ChannelDoubt]:
