@@ -129,7 +129,11 @@ def _run_in_child(path: Path, work: Callable[[], T], sender: Connection, max_cpu
             resource_kind, (limit if hard_limit < 0 else min(limit, hard_limit), hard_limit)
         )
     _drop_rights()
-    sender.send_bytes(pickle.dumps(_capture_result(path, work)))
+    answer = io.BytesIO()
+    pickler = pickle.Pickler(answer)
+    pickler.dispatch_table = {}  # none of the ways that libraries register for errors of all kinds
+    pickler.dump(_capture_result(path, work))
+    sender.send_bytes(answer.getvalue())
 
 
 def _capture_result(path: Path, work: Callable[[], T]) -> T | InputError:

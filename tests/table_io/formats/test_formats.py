@@ -1,5 +1,6 @@
 """Binary formats: one recording out of each of them, what is no column, and hostile files."""
 
+import copyreg
 import ctypes
 import os
 import random
@@ -493,6 +494,20 @@ def swell() -> int:
 def spin() -> None:
     while True:
         pass
+
+
+def test_an_error_is_answered_whatever_a_library_registers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Libraries for clusters change how errors of every kind are written, in the whole process."""
+    monkeypatch.setitem(copyreg.dispatch_table, InputError, lambda error: (repr, (str(error),)))
+
+    def refuse() -> None:
+        raise InputError("no samples", where=tmp_path)
+
+    (tmp_path / "x").touch()
+    with pytest.raises(InputError, match="no samples"):
+        sandbox.run_isolated(tmp_path / "x", refuse)
 
 
 @pytest.mark.parametrize(
