@@ -244,9 +244,7 @@ class _ExternalSession:
         self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
         self._max_samples = self.drive.rest_start + self._rest_samples
         self._lost_samples = 0  # of the command
-        self._clipping_v = np.array(
-            [abs(s.clipping_level_si * s.volts_per_si) for s in rig.sensors]
-        )
+        self._clipping_v = np.array([sensor.clipping_level_v for sensor in rig.sensors])
         self._command_row = rig.channels.index(self.wiring.command)
         self._pending_v = np.empty((len(rig.channels), 0))  # volts not delivered yet
         self._tare: dict[str, float] = {}

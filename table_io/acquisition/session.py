@@ -185,9 +185,7 @@ class _Session:
         self.output_queue = OutputQueue(backend, clock, setup.rig.output, self._state.drive, block)
         self.verdict, self.reason = "complete", "the whole drive was played"
         self._rest_samples = round(profile.acquisition.rest_s * self.rate_hz)
-        self._clipping_v = np.array(
-            [abs(s.clipping_level_si * s.volts_per_si) for s in setup.rig.sensors]
-        )
+        self._clipping_v = np.array([sensor.clipping_level_v for sensor in setup.rig.sensors])
         self.event_log = EventLog(lambda: self.output_queue.acquired)
         self._answered_end = 0  # up to here blocks are answered one by one
 

@@ -173,6 +173,11 @@ class SensorConfig(ConfigModel):
         return CLIP_RATIO * self.range_si
 
     @property
+    def clipping_level_v(self) -> float:
+        """The same in volts, positive."""
+        return abs(self.clipping_level_si * self.volts_per_si)
+
+    @property
     def noise_si(self) -> float:
         """Stated rms noise in SI."""
         return self.noise_rms * self.si_per_unit
