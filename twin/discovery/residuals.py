@@ -560,18 +560,23 @@ class LogResiduals:
 
         Without load cells the damper force is the sum of all forces.
         """
-        mass = parameters.model_for_log(self.log_number, m).parameters.mass
-        measured = np.array(self.measured_forces(m, mass, parameters))
-        return measured - self.expect_forces(parameters, m)
+        model, whole = self._take_whole(parameters, m)
+        return np.array(self._force_errors(model, parameters, whole))
 
     def expect_forces(self, parameters: ParameterSet, m: MeasuredMotion) -> Float2D:
         """Return the modelled damper force, F_R and -F_L on a motion in N, (3, sample).
 
         Without load cells the damper force is the sum of all forces.
         """
-        model = parameters.model_for_log(self.log_number, m)
-        whole = SampledMotion(m, slice(None), m, self.contact_state)
+        model, whole = self._take_whole(parameters, m)
         return np.array(self._expect_forces(model, parameters, whole))
+
+    def _take_whole(
+        self, parameters: ParameterSet, m: MeasuredMotion
+    ) -> tuple[Model, SampledMotion]:
+        """Return the model of this log, and a motion at all of its samples."""
+        model = parameters.model_for_log(self.log_number, m)
+        return model, SampledMotion(m, slice(None), m, self.contact_state)
 
     def _force_errors(
         self, model: Model, parameters: ParameterSet, sampled: SampledMotion
