@@ -414,10 +414,8 @@ def test_the_file_keeps_the_effect(tmp_path: Path) -> None:
     assert config.effect_verdict.probability > 0.95
     assert config.effect_verdict.effects == ("transducer_gain",)
     without = replace(discovery, fitted=discovery.basic)
-    path = replace(result, discovery=without).save(tmp_path / "without.toml")
-    lacking = load_table_twin(path)
+    lacking = load_table_twin(replace(result, discovery=without).save(tmp_path / "without.toml"))
     assert (lacking.effects, lacking.effect_verdict) == ((), config.effect_verdict)
-    path = tmp_path / "table.toml"
     model = config.build_model()
     assert isinstance(model, TableModel)
     assert model.parameters.transducer_gain_error == pytest.approx(0.06, abs=0.01)

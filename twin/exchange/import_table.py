@@ -83,7 +83,7 @@ bumper_damping_n_s_m = 0.0
 """
 MIN_PLACEHOLDER_HZ, MAX_PLACEHOLDER_HZ = 0.01, 1.0  # the least that a sweep may have
 PLACEHOLDER_DAMPING = 0.05
-SAMPLES_PER_CYCLE = 128  # of the placeholder; a power of two, so that no rate is rounded below 100
+SAMPLES_PER_CYCLE = 128  # of the placeholder
 
 
 @dataclass(frozen=True, eq=False)
