@@ -3,6 +3,7 @@
 import errno
 import os
 import random
+import tracemalloc
 from hashlib import sha256
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from tests.recording.example_run import (
 )
 from twin.recording.log_metadata import build_attachments
 from twin.recording.mcap_log import LogWriter, write_items
+from twin.recording.mcap_writer import McapWriter
 from twin.recording.merge import merge, verify_log
 from twin.recording.reader import Recording, read_recording
 from twin.recording.recovery import recover_log
@@ -236,3 +238,17 @@ def test_without_a_stop_only_holes_are_counted_as_missing(tmp_path: Path) -> Non
     recording = read_recording(tmp_path / "run.mcap")
     assert recording.stop is None
     assert recording.missing_samples == BLOCK_SAMPLES
+
+
+def test_the_open_index_of_an_hour_takes_little_memory() -> None:
+    """A live run closes some 24,000 chunks an hour; each entry was an object of 940 bytes."""
+    writer, chunks = McapWriter(lambda data: None, 2**20), 2000
+    channels = [writer.add_channel(f"/{name}", "x.Y", b"") for name in range(8)]
+    tracemalloc.start()
+    for chunk in range(chunks):
+        for channel in channels:
+            writer.add_messages(channel, chunk, [chunk * 10**8], 0, [b"payload"])
+        writer.close_chunk()
+    grown = tracemalloc.get_traced_memory()[0]
+    tracemalloc.stop()
+    assert grown / chunks < 100  # bytes

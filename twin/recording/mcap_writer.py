@@ -36,7 +36,9 @@ class McapWriter:
         self._size = 0
         self._places: dict[int, list[tuple[int, int]]] = {}  # its log times and offsets, by channel
         self._counts: Counter[int] = Counter()  # messages written, by channel
-        self._times: list[int] = []  # log times of the first and the last message of each chunk
+        self._times: tuple[int, ...] = ()  # log times of the first and the last message
+        # A live run closes several chunks a second: their index waits as compressed records.
+        self._packer, self._packed_index, self._chunks = zlib.compressobj(1), bytearray(), 0
         self._summary: dict[int, list[records.McapRecord]] = {kind: [] for kind in SUMMARY_KINDS}
         self._append(MAGIC + _build(records.Header("shaketwin", "shaketwin")))
 
@@ -83,7 +85,7 @@ class McapWriter:
         places = {channel: np.array(pairs, "<u8") for channel, pairs in self._places.items()}
         first = min(int(pairs[:, 0].min()) for pairs in places.values())
         last = max(int(pairs[:, 0].max()) for pairs in places.values())
-        self._times += first, last
+        self._times = min((first, *self._times)), max((last, *self._times))
         packed = zstandard.compress(data)
         start = self._offset
         length = self._append(
@@ -96,11 +98,11 @@ class McapWriter:
             self._append(header + pairs.tobytes())
             self._counts[channel] += len(pairs)
         index_length = self._offset - index_start
-        self._summary[Opcode.CHUNK_INDEX].append(
-            records.ChunkIndex(
-                length, start, "zstd", len(packed), last, index_length, offsets, first, len(data)
-            )
+        entry = records.ChunkIndex(
+            length, start, "zstd", len(packed), last, index_length, offsets, first, len(data)
         )
+        self._packed_index += self._packer.compress(_build(entry))
+        self._chunks += 1
         self._pieces, self._size, self._places = [], 0, {}
 
     def add_attachment(self, time_ns: int, name: str, media_type: str, data: bytes) -> None:
@@ -121,17 +123,18 @@ class McapWriter:
         """Write the last chunk, and the summary by which a reader finds the others."""
         self.close_chunk()
         self._append(_build(records.DataEnd(self._crc)))
+        chunk_index = zlib.decompress(self._packed_index + self._packer.flush())
         counts = {kind: len(entries) for kind, entries in self._summary.items()}
         self._summary[Opcode.STATISTICS].append(
             records.Statistics(
                 counts[Opcode.ATTACHMENT_INDEX], counts[Opcode.CHANNEL], self._counts,
-                counts[Opcode.CHUNK_INDEX], self._counts.total(), max(self._times, default=0),
+                self._chunks, self._counts.total(), max(self._times, default=0),
                 min(self._times, default=0), counts[Opcode.METADATA_INDEX], counts[Opcode.SCHEMA],
             )
         )  # fmt: skip
         start, groups, summary = self._offset, b"", b""
         for kind, entries in self._summary.items():
-            group = _build(*entries)
+            group = chunk_index if kind == Opcode.CHUNK_INDEX else _build(*entries)
             groups += _build(records.SummaryOffset(kind, start + len(summary), len(group)))
             summary += group
         footer = FOOTER_RECORD.pack(Opcode.FOOTER, 20, start, start + len(summary))
