@@ -179,11 +179,14 @@ class TableResponse(ConfigModel):
         "no less than that, but no more than the test.",
     )
     gain: tuple[Positive, Positive] = Field(
-        (0.8, 1.2), description="Gain at the lowest frequency, from and to."
+        (0.8, 1.2),
+        description="Gain at the lowest frequency, from and to; the first for a table that follows "
+        "without lag, less for one of `lag_ms`.",
     )
     top_gain: tuple[Positive, Positive] = Field(
         (0.5, 1.25),
-        description="Gain at the end of the sweep; amplitude control doubles a command at most.",
+        description="Gain at the end of the sweep. The least of all gains accepted limits by how "
+        "much amplitude control raises a command.",
     )
     gain_residual_percent: Positive = Field(
         10.0, description="Gain off a straight line of its logarithm over the square of frequency."
@@ -214,6 +217,11 @@ class TableResponse(ConfigModel):
         if limits[0] >= limits[1]:
             raise InputError(f"{limits[0]:g} to {limits[1]:g} is no range", allowed="low, high")
         return limits
+
+    @property
+    def max_correction(self) -> float:
+        """Largest factor on a command for the table's gain; beyond is a fault, not a roll-off."""
+        return 1.0 / min(self.gain[0], self.top_gain[0])
 
 
 class RigConfig(ConfigModel):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from table_io.config.profile import ControlConfig
+from table_io.config.rig import TableResponse
 from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
 from table_io.harmonics import HarmonicFit
@@ -19,17 +20,20 @@ CANCELLED_ORDERS = (2, 3, 4, 5)  # harmonic orders of the table acceleration
 ACCEPTED_TOLERANCE_SHARE = (
     0.5  # of the tolerance; the rest is left for drift during the measured cycles
 )
-MAX_CORRECTION = 2.0  # of the correction and of its inverse; beyond is a fault, not a roll-off
 CANCEL_GAIN = 0.8
 CANCELLED_RATIO = 10 ** (-15 / 20)  # of a harmonic at the first evaluation: cancelled
 
 
 @dataclass(frozen=True)
 class Tuning:
-    """Tuning state: the table's FRF at low level and the accepted corrections."""
+    """Tuning state: the table's FRF at low level and the accepted corrections.
+
+    `max_correction` limits a correction and its inverse (`TableResponse.max_correction`).
+    """
 
     response: FrequencyResponse | None = None
     accepted: tuple[SineTarget, ...] = ()
+    max_correction: float = TableResponse().max_correction
 
     def predict_target(self, step: Step) -> SineTarget:
         """Predict the start target of a step from this frequency, else from its neighbor."""
@@ -40,7 +44,7 @@ class Tuning:
         if self.accepted:
             neighbour = self.accepted[-1]
             correction *= neighbour.correction / self._inverse_gain(neighbour.frequency_hz)
-        return SineTarget(step.frequency_hz, step.acceleration_m_s2, _clamp_correction(correction))
+        return SineTarget(step.frequency_hz, step.acceleration_m_s2, self.clamp(correction))
 
     def add_accepted(self, target: SineTarget) -> "Tuning":
         """Return the tuning with one more accepted correction."""
@@ -52,6 +56,10 @@ class Tuning:
     def transfer(self, frequency_hz: float) -> complex:
         """Return the complex FRF, table acceleration over command; 1 if none was identified."""
         return 1.0 + 0j if self.response is None else evaluate_transfer(self.response, frequency_hz)
+
+    def clamp(self, correction: float) -> float:
+        """Return the correction within its limit."""
+        return float(np.clip(correction, 1.0 / self.max_correction, self.max_correction))
 
     def _inverse_gain(self, frequency_hz: float) -> float:
         return 1.0 / abs(self.transfer(frequency_hz))
@@ -74,7 +82,7 @@ def update_target(
     if abs(error) > ACCEPTED_TOLERANCE_SHARE * config.tolerance:
         max_factor = 10 ** (config.clamp_db / 20)
         factor = float(np.clip((1.0 + error) ** -config.gain, 1.0 / max_factor, max_factor))
-        new_target = replace(new_target, correction=_clamp_correction(target.correction * factor))
+        new_target = replace(new_target, correction=tuning.clamp(target.correction * factor))
     if config.harmonics:
         new_target = replace(new_target, shape=_cancel_harmonics(target, measured, first, tuning))
     return new_target
@@ -105,7 +113,3 @@ def _cancel_harmonics(
         response = tuning.transfer(order * target.frequency_hz) * target.corrected_m_s2 * order**2
         shape.append(previous - CANCEL_GAIN * complex(amplitude) / response)
     return tuple(shape) if any(shape) else ()
-
-
-def _clamp_correction(correction: float) -> float:
-    return float(np.clip(correction, 1.0 / MAX_CORRECTION, MAX_CORRECTION))

@@ -14,13 +14,12 @@ from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.config.sensor import CLIP_RATIO
-from table_io.control.amplitude_control import MAX_CORRECTION
 from table_io.control.orbit_feedback import MAX_COMMAND_RATIO
 from table_io.control.table_response import evaluate_gain
 from table_io.errors import InputError
 from table_io.excitation.drive import Drive, HistorySegment, Segment, envelope_acceleration
 from table_io.records import FrequencyResponse, Step
-from table_io.safety.loop_check import list_known_faults, plan_targets
+from table_io.safety.loop_check import is_below_friction, list_known_faults, plan_targets
 from table_io.units import GRAVITY_M_S2
 
 LOOP_CHECK = "loop check"
@@ -115,10 +114,8 @@ def compute_demands(drive: Drive, profile: Profile, rig: RigConfig) -> tuple[Ste
     ]
     for step in drive.steps:
         peaks_of_step = step_peaks.get(step.index, [_steady_peaks(step)])
-        if profile.continuation is not None:
-            largest = tuple(max(values) for values in zip(*peaks_of_step, strict=True))
-            share = profile.continuation.max_feedback
-            peaks_of_step = [_add_feedback(step, largest, share, drive.rate_hz)]
+        largest = tuple(max(values) for values in zip(*peaks_of_step, strict=True))
+        peaks_of_step = [_add_feedback(profile, step, largest)]
         rows.append(_build_demand(step, peaks_of_step, mass, rig))
     if profile.swept_sine is not None:
         rows += _sweep_demands(drive, step_peaks, mass, rig)
@@ -142,19 +139,22 @@ def _sweep_demands(
 
 
 def _add_feedback(
-    step: Step, peaks: tuple[float, ...], share: float, rate_hz: float
+    profile: Profile, step: Step, peaks: tuple[float, ...]
 ) -> tuple[float, float, float]:
-    """Return the bounds of (displacement, velocity, acceleration) with a feedback, SI.
+    """Return the bounds of (displacement, velocity, acceleration) with a feedback, if any, SI.
 
     The amplitude of the feedback is limited to a share of the held step, and the acceleration of
     both together (`control/orbit_feedback.py`). |q'| <= sqrt(2 max|q| max|q''|) for any motion that
     begins and ends at rest. A stop multiplies both, which are close to a sine, by its decay.
     """
-    d, _, a = _steady_peaks(step)
+    if profile.continuation is None:
+        return peaks[0], peaks[1], peaks[2]
+    (d, _, a), rate_hz = _steady_peaks(step), profile.acquisition.rate_hz
     stop = Segment(0, 1, Label.STOP, step.index, step.frequency_hz, step.frequency_hz, a, 0.0, 0.0)
     stop = replace(stop, count=stop.decay_samples(0.0, rate_hz))
     decaying = envelope_acceleration(stop, np.linspace(0.0, 1.0, 401), rate_hz)
-    displacement, acceleration = peaks[0] + share * d, MAX_COMMAND_RATIO * float(decaying.max())
+    displacement = peaks[0] + profile.continuation.max_feedback * d
+    acceleration = MAX_COMMAND_RATIO * float(decaying.max())
     velocity = math.sqrt(2.0 * displacement * acceleration)
     return (displacement, velocity, max(peaks[2], acceleration))
 
@@ -491,12 +491,12 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
             f"fewer than {rig.output.least_lsb} DAC steps; the response above {highest_hz:.3g} Hz "
             "is extrapolated"
         )
-    level_g, least_g = profile.plan.level_m_s2 / GRAVITY_M_S2, rig.table_response.least_level_g
-    if level_g < least_g:
+    if is_below_friction(profile, rig):
         messages.append(
-            f"the level is {level_g:.3g} g at most, below table_response.least_level_g = "
-            f"{least_g:g}: friction shapes what this table plays, and the loop check may refuse "
-            "its gain or delay; raise the level"
+            f"the level is {profile.plan.level_m_s2 / GRAVITY_M_S2:.3g} g at most, below "
+            f"table_response.least_level_g = {rig.table_response.least_level_g:g}: friction shapes "
+            "what this table plays, and the loop check judges neither its gain nor its delay; "
+            "raise the level"
         )
     if {"acceleration_g", "level_points"} <= profile.excitation.model_fields_set:
         kind = profile.excitation.kind
@@ -513,22 +513,24 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
 
 
 def check_corrected_drive(
-    steps: tuple[Step, ...], response: FrequencyResponse, rig: RigConfig
+    profile: Profile, steps: tuple[Step, ...], response: FrequencyResponse, rig: RigConfig
 ) -> list[str]:
     """List a message per limit that the command corrected for the measured response exceeds.
 
     The table then moves as demanded, but its command is larger by 1 / gain. So displacement,
     velocity and acceleration of the command are compared with the limits of the rig, and 1 / gain
-    with MAX_CORRECTION of amplitude control.
+    with the largest correction that the gains which it accepts allow.
     """
+    max_correction = rig.table_response.max_correction
     rows, excessive = [], []
     for step in steps:
         correction = 1.0 / evaluate_gain(response, step.frequency_hz)
-        d, v, a = (correction * peak for peak in _steady_peaks(step))
+        peaks = _add_feedback(profile, step, _steady_peaks(step))
+        d, v, a = (correction * peak for peak in peaks)
         rows.append(
             StepDemand(step.index, step.direction, step.frequency_hz, d, v, a, 0.0, math.inf)
         )
-        if correction > MAX_CORRECTION:
+        if correction > max_correction:
             excessive.append((correction, rows[-1]))
     faults = [
         f"corrected for the table's response, {fault}"
@@ -539,7 +541,7 @@ def check_corrected_drive(
         faults.append(
             f"{row.name}: the table follows with a gain of {1.0 / correction:.3g}, so the command "
             f"would have to be {correction:.3g} times as large; "
-            f"allowed: at most {MAX_CORRECTION:g}. "
+            f"allowed: at most {max_correction:g} by the gains that table_response accepts. "
             "Lower sweep.stop_hz, or tune the servo"
         )
     return faults

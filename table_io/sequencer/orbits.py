@@ -155,8 +155,8 @@ def _find_table_lag(state: SequencerState, frequency_hz: float) -> float:
 
 def _find_correction(state: SequencerState, frequency_hz: float) -> float:
     """Return the factor on the command that gives the level, as the last orbit corrected it."""
-    response, factor = state.tuning.response, _search(state).level_factor
-    return factor if response is None else factor / abs(evaluate_transfer(response, frequency_hz))
+    gain = abs(state.tuning.transfer(frequency_hz))
+    return state.tuning.clamp(_search(state).level_factor / gain)
 
 
 def _config(state: SequencerState) -> Continuation:

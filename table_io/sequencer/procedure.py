@@ -165,18 +165,19 @@ def decide_after_check(state: SequencerState) -> SequencerState:
     failed = [check for check in checks if not check.passed]
     if response is not None:
         records.append(replace(response, index=index))
+    tuning = replace(state.tuning, response=response)
     reason = "; ".join(_format_failure(check) for check in failed)
-    if not failed and response is not None and plan.profile.control.enabled:
-        reason = "; ".join(check_corrected_drive(state.steps, response, plan.rig))
+    is_corrected = plan.profile.control.enabled or plan.profile.continuation is not None
+    if not failed and response is not None and is_corrected:
+        reason = "; ".join(check_corrected_drive(plan.profile, state.steps, response, plan.rig))
     if reason:
         reason = f"the loop check failed: {reason}"
     elif plan.profile.continuation is not None:
-        reason = check_latency(replace(state, tuning=Tuning(response)))
+        reason = check_latency(replace(state, tuning=tuning))
     if reason:
         return replace(
             state, stage=Stage("end"), refusal=reason, records=(*state.records, *records)
         )
-    tuning = Tuning(response)
     state = replace(state, tuning=tuning, records=(*state.records, *records))
     if plan.profile.continuation is not None:
         return begin_continuation(state)
@@ -369,8 +370,11 @@ def start_test(plan: TestPlan) -> SequencerState:
     trajectory, steps = start_trajectory(profile), profile.steps
     blend_cycles = profile.plan.blend_cycles
     targets = loop_check.plan_targets(profile, plan.rig) if profile.loop_check.enabled else ()
+    tuning = Tuning(max_correction=plan.rig.table_response.max_correction)
     if not targets:
-        initial = SequencerState(plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps)
+        initial = SequencerState(
+            plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps, tuning
+        )
         begin = begin_continuation if profile.continuation is not None else begin_excitation
         return begin(initial)
     for target in targets:
@@ -385,7 +389,7 @@ def start_test(plan: TestPlan) -> SequencerState:
         math.ceil(profile.loop_check.rest_s * trajectory.rate_hz) + plan.margin
     )
     stage = Stage("check", -1, 0, trajectory.end - plan.margin)
-    return SequencerState(plan, trajectory, trajectory.to_drive(steps), stage, steps)
+    return SequencerState(plan, trajectory, trajectory.to_drive(steps), stage, steps, tuning)
 
 
 def advance_test(state: SequencerState, block: Block) -> tuple[SequencerState, tuple[Record, ...]]:

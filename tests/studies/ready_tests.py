@@ -2,8 +2,8 @@
 
     python -m tests.studies.ready_tests --count 200 --seed 1
 
-Profiles, records and rigs are drawn at random. A line is printed for each ready test: how it ended,
-of a refusal after motion with its reason.
+Profiles, records and rigs are drawn at random; each rig is tared, as a laboratory does. A line is
+printed for each ready test: how it ended, of a refusal after motion with its reason.
 """
 
 import argparse
@@ -22,7 +22,9 @@ from table_io.clock import ManualClock
 from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.records import RunStop
+from table_io.units import GRAVITY_M_S2
 from twin.rig.check import check_test
+from twin.rig.tare import TareOptions, tare
 from twin.setup.run_config import RunConfig
 
 KINDS = ("sweep", "sweep", "record", "long record", "random", "multisine", "swept_sine")
@@ -95,6 +97,9 @@ def draw_profile(rng: np.random.Generator, folder: Path) -> str:
     rig = re.sub(r"(?m)^bits = 18$", f"bits = {rng.choice([12, 14, 16, 18])}", rig)
     rig = re.sub(r"stroke_mm = 60.0", f"stroke_mm = {rng.uniform(20, 60):.0f}", rig)
     (folder / "rig.toml").write_text(rig)
+    for record in (folder / "rig.tares").glob("*.toml"):
+        record.unlink()
+    tare(TareOptions(str(folder / "rig.toml")), lambda _: None)
     return f"{kind} on {name}"
 
 
@@ -121,11 +126,14 @@ def play_loop_check(config: RunConfig) -> tuple[str, str]:
 def draw_ready_tests(
     folder: Path, rng: np.random.Generator
 ) -> Iterator[tuple[str, RunConfig | None]]:
-    """Yield (kind, configuration) of tests that `check` calls ready."""
+    """Yield (kind, configuration) of tests that `check` calls ready; the kind with its level."""
     while True:
         kind = draw_profile(rng, folder)
         try:
-            yield kind, check_test(folder / "ready.toml").config
+            config = check_test(folder / "ready.toml").config
+            plan = config.profile.plan
+            level_g = plan.level_m_s2 / GRAVITY_M_S2
+            yield f"{kind}, {level_g:.3g} g, {plan.low_hz:.3g} to {plan.high_hz:.3g} Hz", config
         except InputError as error:
             yield f"not ready: {error}", None
 

@@ -20,6 +20,7 @@ from table_io.config.calibration import command_to_volts, compute_tare, measure_
 from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.config.tare import TareRecord
 from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.drive import Drive
 from table_io.excitation.trajectory import Trajectory, start_trajectory
@@ -362,6 +363,19 @@ def test_known_noise_is_refused_with_that_of_its_converter_and_of_a_short_rest(b
         assert all(" dB below the level " in fault for fault in faults)
 
 
+@pytest.mark.parametrize(("factor", "count"), [(0.99, 0), (1.01, 1)])
+def test_noise_of_the_newest_tare_is_known_before(factor: float, count: int) -> None:
+    profile, sensor = record_loop_check("g4_ss3")[0], RIG.sensor("mass_acc_m_s2")
+    limit_v = abs(sensor.volts_per_si) * profile.plan.level_m_s2 / math.sqrt(2.0) / 10.0
+    rest_samples = profile.acquisition.rest_s * profile.acquisition.rate_hz
+    limit_v /= 1.0 + 4.0 / math.sqrt(2.0 * rest_samples)
+    tare = TareRecord(
+        rig=RIG.name, at="2026-01-01T00:00:00+00:00", by="x", seconds=1.0,
+        channels=(sensor.channel,), volts=(0.0,), noise_v=(factor * limit_v,),
+    )  # fmt: skip
+    assert len(list_known_faults(profile, RIG.model_copy(update={"tare": tare}))) == count
+
+
 @pytest.mark.parametrize("name", ["g4_ss3", "ginf", "gm1"])
 def test_mass_laser_on_the_table_is_told_from_a_reversed_one(name: str) -> None:
     """One line names it; those that would blame its sign or its gain are left out."""
@@ -441,6 +455,31 @@ def test_swapped_laser_and_accelerometer_fail_polarity_and_gain_of_both() -> Non
 def test_table_that_is_too_slow_fails(name: str, simulated: dict[str, float], line: str) -> None:
     check_run = run_loop_check(read_shipped_profile(name), change_rig(simulated=simulated))
     assert list_failures(check_run) == {(line, "table_disp_m"), (line, "table_acc_m_s2")}
+
+
+@pytest.mark.parametrize(("lag_ms", "passes"), [(1.0, False), (15.0, True)])
+def test_gain_at_the_lowest_frequency_rolls_off_with_the_lag(lag_ms: float, passes: bool) -> None:
+    profile, block, drive, noise = record_loop_check("gm10")
+    rig = change_rig(table_response={"gain": [1.0, 1.2], "lag_ms": lag_ms})
+    checks = evaluate(block, drive, profile, rig, noise)[0]
+    assert find_line(checks, "gain", "table_disp_m").value < 1.0
+    failed = {check.name for check in checks if not check.passed}
+    assert failed == (set() if passes else {"gain"})
+
+
+@pytest.mark.parametrize(("least_level_g", "passes"), [(0.05, False), (0.0501, True)])
+def test_gain_of_a_table_below_its_least_level_is_reported_only(
+    least_level_g: float, passes: bool
+) -> None:
+    slow = run_loop_check(
+        read_shipped_profile("gm10"), change_rig(simulated={"servo_bandwidth_hz": 5.0})
+    )
+    profile, block, drive, noise = slow
+    rig = change_rig(table_response={"least_level_g": least_level_g})
+    checks = evaluate(block, drive, profile, rig, noise)[0]
+    line = find_line(checks, "gain at the highest frequency", "table_disp_m")
+    assert line.value < rig.table_response.top_gain[0]
+    assert line.passed == passes
 
 
 def test_mass_pressed_aside_by_uneven_bumpers_is_not_off() -> None:

@@ -29,7 +29,7 @@ from table_io.safety.preflight import (
     list_limits,
     list_setup_warnings,
 )
-from table_io.sequencer.procedure import make_test_plan, nominal_drive
+from table_io.sequencer.procedure import make_test_plan, nominal_drive, start_test
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_history_profile, make_profile
 from tests.builders.rigs import RIG, change_rig
@@ -143,7 +143,10 @@ def make_controlled(share: float) -> Any:
     """Return a test whose steps are held with feedback of a share of their command."""
     continuation = SimpleNamespace(max_feedback=share)
     return SimpleNamespace(
-        specimen=make_test().specimen, continuation=continuation, swept_sine=None
+        acquisition=make_test().acquisition,
+        specimen=make_test().specimen,
+        continuation=continuation,
+        swept_sine=None,
     )
 
 
@@ -593,29 +596,35 @@ def test_corrected_command_is_the_motion_over_the_gain(
     for share, count in ((1 + 1e-9, 0), (1 - 1e-9, 1)):
         output = {"span_mm": 1e3, "bits": 32}
         rig = change_rig(output=output, limits=wide | {field: share * demand})
-        assert len(check_corrected_drive((step,), make_flat(gain), rig)) == count
+        assert len(check_corrected_drive(make_test(), (step,), make_flat(gain), rig)) == count
 
 
 def test_corrected_command_warning_states_steps_and_limit() -> None:
     steps = make_test().sweep.steps
-    (warning,) = check_corrected_drive(steps, make_flat(0.8), RIG)
+    (warning,) = check_corrected_drive(make_test(), steps, make_flat(0.8), RIG)
     assert warning.startswith("corrected for the table's response")
     assert f"{SLOWEST} and 1 more: displacement: 62.1 mm" in warning
     assert "allowed: at most 60 mm" in warning
     # 0.05 g at 10 Hz asked of a table that gives 0.6 of it.
     fallen = FrequencyResponse(5, (1.0, 3.0, 10.0), (1.0, 1.0, 0.6), (0.0, 0.0, 0.0))
     rig = change_rig(limits={"acceleration_g": 0.08})
-    (warning,) = check_corrected_drive(steps, fallen, rig)
+    (warning,) = check_corrected_drive(make_test(), steps, fallen, rig)
     assert "(10 Hz forward) and 1 more: acceleration: 0.08333 g" in warning
 
 
-@pytest.mark.parametrize(("gain", "count"), [(0.5 * (1 + 1e-9), 0), (0.5 * (1 - 1e-9), 1)])
-def test_command_may_be_doubled_and_no_more(gain: float, count: int) -> None:
+@pytest.mark.parametrize("least", [0.2, 0.5])
+@pytest.mark.parametrize(("share", "count"), [(1 + 1e-9, 0), (1 - 1e-9, 1)])
+def test_command_is_corrected_for_every_gain_that_the_rig_accepts_and_no_less(
+    least: float, share: float, count: int
+) -> None:
     (step, *_) = make_test(5.0, 10.0).sweep.steps
-    warnings = check_corrected_drive((step, step), make_flat(gain), RIG)
+    rig = change_rig(table_response={"top_gain": [least, 1.25]})
+    warnings = check_corrected_drive(make_test(), (step, step), make_flat(least * share), rig)
     assert len(warnings) == count
-    part = "step 0 (5 Hz forward): the table follows with a gain of 0.5"
+    part = f"step 0 (5 Hz forward): the table follows with a gain of {least:g}"
     assert all(warning.startswith(part) for warning in warnings)
+    tuning = start_test(make_test_plan(make_test(), rig)).tuning
+    assert tuning.clamp(9.0) == pytest.approx(1.0 / least)
 
 
 def test_a_level_beside_break_points_is_not_ignored_silently() -> None:
