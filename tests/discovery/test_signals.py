@@ -1,9 +1,11 @@
 """Motion from lasers and accelerometers, and what their disagreement says."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import butter, lfilter
 
 from table_io.block import Block, Label, join_blocks
 from table_io.errors import InputError
@@ -138,6 +140,24 @@ def replace_lasers(block: Block) -> Block:
     relative = block.values[lasers[0]] - block.values[lasers[1]]
     names = ("rel_disp_m", *(block.channels[k] for k in others))
     return replace(block, channels=names, values=np.array([relative, *block.values[others]]))
+
+
+@pytest.mark.parametrize("corner", [0.1, 0.2, 0.35])
+def test_the_filter_of_a_logger_shows_in_motion_where_there_is_no_rest(corner: float) -> None:
+    """Its response to the force step of an impact was fitted as an appendage of 37 Hz."""
+    measured = join_blocks(blocks())
+    moving = measured.cut(measured.index + 3000, measured.end - 1000)
+    filtered = replace(moving, values=lfilter(*butter(4, 2 * corner), moving.values))
+    one_alone = moving.values.copy()
+    place = moving.channels.index("mass_acc_m_s2")
+    one_alone[place] = filtered.values[place]
+
+    def find_filter_hz(block: Block) -> float:
+        return build_signals((block,), "moving", 550.0, (0.002, 0.002)).filter_hz
+
+    assert find_filter_hz(filtered) == pytest.approx(750.0 * corner, rel=0.25)
+    assert math.isinf(find_filter_hz(moving))
+    assert math.isinf(find_filter_hz(replace(moving, values=one_alone)))
 
 
 def test_without_displacement_there_is_nothing_to_learn() -> None:

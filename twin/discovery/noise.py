@@ -155,6 +155,14 @@ def find_loudest_power(values: Float1D, rate_hz: float) -> NoiseBands:
     return NoiseBands(segments[0].frequency, loudest, segments[0].sigma)
 
 
+def find_shown_roll_off(values: Float1D, rate_hz: float) -> float:
+    """Return where quiet segments in motion fall as behind an anti-alias filter, Hz; inf: nowhere.
+
+    There the motion may end, too; but not in every channel, as where a logger filters.
+    """
+    return _find_roll_off(_estimate_quiet_bands(values[np.isfinite(values)])) * rate_hz
+
+
 def _find_resolution(values: Float1D) -> float:
     """Return the step of a coarsely quantised channel; 0 where nearly all samples differ."""
     levels = np.unique(values)
@@ -201,12 +209,12 @@ def _average_bands(
     return NoiseBands(frequency, np.maximum(mean, 1e-300), sigma)
 
 
-def _find_roll_off(at_rest: NoiseBands) -> float:
+def _find_roll_off(noise: NoiseBands) -> float:
     """Return the frequency above which an anti-alias filter lowers the noise; inf without one."""
-    power, octave = at_rest.power, BANDS_PER_OCTAVE
+    power, octave = noise.power, BANDS_PER_OCTAVE
     falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
-    rolling_off = np.flatnonzero(falls & (at_rest.frequency[:-octave] > MIN_FILTER_CYCLES))
-    return float(at_rest.frequency[rolling_off[0]]) if rolling_off.size else math.inf
+    rolling_off = np.flatnonzero(falls & (noise.frequency[:-octave] > MIN_FILTER_CYCLES))
+    return float(noise.frequency[rolling_off[0]]) if rolling_off.size else math.inf
 
 
 def _fit_white_and_slow(at_rest: NoiseBands, passed: int) -> tuple[float, float]:

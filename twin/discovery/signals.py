@@ -27,6 +27,7 @@ from twin.discovery.noise import (
     compare_with_white,
     estimate_noise_density,
     find_loudest_power,
+    find_shown_roll_off,
     measure_rest_noise,
     number_bands,
 )
@@ -92,6 +93,7 @@ class LogSignals:
     surface_noise_m: float = 0.0  # rms error of each laser in motion, besides its noise
     hum_hz: tuple[float, ...] = ()  # lines of the mains that were removed
     measured_sides: tuple[str, ...] = ()  # whose gaps load cells show, where none is stated
+    shared_filter_hz: float = math.inf  # where all channels roll off, if there is no rest
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -118,7 +120,8 @@ class LogSignals:
     @property
     def filter_hz(self) -> float:
         """Frequency where the slowest anti-alias filter begins to act; inf without one."""
-        return min((noise.roll_off_hz for noise in self.rest_noise.values()), default=math.inf)
+        at_rest = (noise.roll_off_hz for noise in self.rest_noise.values())
+        return min(at_rest, default=self.shared_filter_hz)
 
     @property
     def zero_channels(self) -> dict[str, tuple[tuple[str, float], ...]]:
@@ -564,6 +567,9 @@ def build_signals(
         usable[:: grid.decimation],
         rest_noise,
         hum_hz=hum_hz,
+        shared_filter_hz=math.inf if rest_noise else max(
+            find_shown_roll_off(values, block.rate_hz) for values in columns.values()
+        ),
     )  # fmt: skip
     band_hz = signals.find_force_band()
     hz = grid.omega / (2.0 * np.pi)
