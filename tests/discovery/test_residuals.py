@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from tests.discovery.played import SNM, format_truth, log
+from twin.discovery.learned_noise import limit_bumper_bands
 from twin.discovery.nuisances import resolve_samples
 from twin.discovery.parameters import (
     STIFFNESS,
@@ -98,7 +99,7 @@ def test_forces_are_fitted_up_to_where_they_exceed_the_noise_of_the_motion() -> 
         noise = {name: factor * values for name, values in prepared.signals.noise.items()}
         signals = replace(prepared.signals, noise=noise)
         (residuals,) = build_log_residuals([(signals, prepared.contact_n)], SNM)
-        bands.append(residuals.with_row_bands(parameters).row_bands)
+        bands.append(limit_bumper_bands(residuals, parameters).row_bands)
     quiet, loud = bands
     assert {*quiet} == {*CONTACT_ROWS}
     for name in CONTACT_ROWS:

@@ -9,6 +9,7 @@ from table_io.block import Float1D
 from table_io.errors import InputError
 from table_io.records import Step
 from twin.discovery.candidates import list_candidates
+from twin.discovery.learned_noise import learn_noise, limit_bumper_bands
 from twin.discovery.least_squares import FitResult, MapFunction, fit_parameters, fit_with_misfit
 from twin.discovery.localization import (
     Localization,
@@ -135,7 +136,7 @@ def prepare_problem(
     first = fit_parameters(log_residuals, parameters, mapper=mapper)
     fitted = first.parameters
     log_residuals = tuple(
-        residuals.with_row_bands(fitted)
+        limit_bumper_bands(residuals, fitted)
         for residuals in build_log_residuals(pairs, fitted.to_model())
     )
     notes = []
@@ -201,7 +202,7 @@ def add_nuisances(
             _start_nuisances(with_terms, fit.parameters.with_free(start.free)),
             mapper=mapper,
         )
-        with_terms = tuple(residuals.with_learned_noise(fit.parameters) for residuals in with_terms)
+        with_terms = tuple(learn_noise(residuals, fit.parameters) for residuals in with_terms)
     fit = fit_with_misfit(with_terms, fit.parameters, mapper=mapper)
     return with_terms, fit
 
@@ -328,7 +329,7 @@ def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedPr
     fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
     base = fitted.remove_from(fit.parameters)
     log_residuals = tuple(
-        residuals.with_learned_noise(fit.parameters, base) for residuals in log_residuals
+        learn_noise(residuals, fit.parameters, base) for residuals in log_residuals
     )
     first = fit_with_misfit(
         log_residuals, fitted.remove_from(fit.parameters), mapper=problem.mapper

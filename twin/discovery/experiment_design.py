@@ -21,6 +21,7 @@ from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from table_io.errors import InputError
 from twin.compare.sensors import apply_sensors, lag_samples
 from twin.discovery.hidden_effects import UndetectedEffect, find_hidden_effects
+from twin.discovery.learned_noise import learn_noise
 from twin.discovery.least_squares import fill_jacobian, solve_damped
 from twin.discovery.nuisances import linearize_nuisances, list_nuisance_parameters
 from twin.discovery.parameters import (
@@ -387,7 +388,7 @@ def make_residuals(
         return residuals
     start = _start_rival(fitted, *problem.log_residuals, residuals)
     residuals = linearize_nuisances(residuals, start, mapper=problem.mapper)
-    return residuals.with_learned_noise(start)
+    return learn_noise(residuals, start)
 
 
 def simulate_motion(

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from table_io.block import Bool1D, Bool2D, Float1D, Float2D, Int1D
+from twin.discovery.learned_noise import weigh_misfit
 from twin.discovery.parameters import (
     FreeParameter,
     NuisanceKey,
@@ -108,7 +109,7 @@ def fit_with_misfit(
     cross-validation residual of the result are over the noise alone nevertheless.
     """
     fit = fit_parameters(log_residuals, start, mapper=mapper)
-    weighted = [residuals.with_misfit(fit.parameters) for residuals in log_residuals]
+    weighted = [weigh_misfit(residuals, fit.parameters) for residuals in log_residuals]
     ratios = [
         new.entry_weight / old.entry_weight
         for new, old in zip(weighted, log_residuals, strict=True)

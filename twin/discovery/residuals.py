@@ -20,11 +20,11 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import binary_opening
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
 from twin.compare.spectra import exclude_margins
+from twin.discovery.contact import find_contact_thresholds, read_contact
 from twin.discovery.facts import BlockBasis
 from twin.discovery.motion import (
     ConsistencyResidual,
@@ -32,20 +32,13 @@ from twin.discovery.motion import (
     RecordScale,
     measure_scale,
 )
-from twin.discovery.noise import BAND_COUNT, number_bands
+from twin.discovery.noise import number_bands
 from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet
 from twin.discovery.signals import LogSignals, derives_acc
-from twin.evidence.linear import UNKNOWN_ERROR_SHARE
-from twin.evidence.verdict import MAX_LEVEL
 from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
 
 MAX_GAP_ERROR_M = 1e-3  # of the readings of the set-up: with more, a gap is to be measured again
-MEDIAN_OF_NORMAL = 0.6745  # of the magnitude of a normal variable, over its standard deviation
-CONTACT_NOISE_FACTOR = 8.0  # times the rms noise of a load cell: above it there is contact
-MIN_CONTACT_SHARE = 0.02  # of the rms inertia force: below it a load cell shows no contact
-# A shorter contact is the ringing of a filter before or after a step of the force.
-MIN_CONTACT_SAMPLES, MIN_CONTACT_FILTER_CYCLES = 3, 0.5
 CONTACT_MARGIN_S = 0.012  # around contact and release, where the low pass smears the force step
 # The same after an anti-alias filter: periods of its corner until its response to a step has died.
 FILTER_SETTLING_CYCLES = 3.0
@@ -57,16 +50,9 @@ PULL_ROWS = ("right pull", "left pull")
 PULLING_CELLS = {"right pull": "right cells", "left pull": "left cells"}
 # of the largest contact force: undershoot of the low pass after a release
 MAX_UNDERSHOOT_SHARE = 0.005
-# Of the force of a law, rms: what its form in the library leaves of that of a specimen.
-FORM_ERROR_SHARE = 0.02
-MIN_CHANGES = 8  # values of a step that show the noise
-CHANGE_ORDER = 3.0  # of a law whose force changes with the motion
 MAX_RESIDUAL = 1e30  # times the noise: beyond it a model diverges, however far
 MAX_CACHED_MOTIONS = 3  # for assumed sensor models other than the nominal one
 MAX_KNOWN_FORCES = 8  # of the models last evaluated, which limits memory
-# Power of a bumper's force over the noise of its row, up to the highest frequency of its facts:
-# with less, noise of the motion would shift its slopes by a larger share than the inverse.
-MIN_FACT_RATIO = 16.0
 MAX_SAMPLES = 120_000  # moving samples of all logs together; limits time and memory
 
 
@@ -355,27 +341,6 @@ class LogResiduals:
             )
             for name, samples in zip(self.rows, self._row_samples, strict=True)
         )
-
-    def with_row_bands(self, parameters: ParameterSet) -> "LogResiduals":
-        """Return the residuals up to where the forces of bumpers exceed the noise of their rows.
-
-        It is the noise that they show about a fitted model. Above that frequency these rows are
-        noise of the motion, which the parameters of the bumpers scale.
-        """
-        learned = self.with_learned_noise(parameters)
-        measured = learned.measured_entries * learned.entry_weight
-        bands = {}
-        for name in CONTACT_ROWS:
-            row = FORCE_ROWS.index(name)
-            basis = self.bases[row]
-            if basis is None or not basis.size:
-                continue
-            number = number_bands(basis.frequency_hz)
-            squares = measured[learned.entry_row == row] ** 2
-            power = np.bincount(number, squares) / np.maximum(np.bincount(number), 1)
-            loud = number <= np.flatnonzero(power > MIN_FACT_RATIO).max(initial=0)
-            bands[name] = float(basis.frequency_hz[loud].max(initial=0.0))
-        return replace(self, row_bands=bands)
 
     @cached_property
     def _entry_samples(self) -> tuple[Int1D, ...]:
@@ -702,7 +667,7 @@ class LogResiduals:
         return np.sqrt(np.mean(self.noise_scale[name][number_bands(hz)] ** 2, keepdims=True))
 
     @cached_property
-    def _entry_noise(self) -> Float1D:
+    def entry_noise(self) -> Float1D:
         """Rms noise of each entry but those at rest, (entry,)."""
         sizes = [samples.size for samples in self._entry_samples]
         return np.concatenate(
@@ -722,128 +687,6 @@ class LogResiduals:
     def with_signals(self, signals: LogSignals) -> "LogResiduals":
         """Return the residuals of other readings of the same test, with the same contacts."""
         return replace(self, signals=signals, motion_cache=[], known_contact=self.contact_state)
-
-    def with_learned_noise(
-        self, parameters: ParameterSet, base: ParameterSet | None = None
-    ) -> "LogResiduals":
-        """Return the residuals with the noise that they show themselves about a fitted model.
-
-        What does not repeat between the cycles of a step is noise, also where neither the rest nor
-        a quiet band shows it: half the mean square of the difference of successive cycles, less
-        what the motion itself did not repeat, the median over the steps. And instruments err by a
-        share of the force in ways of which no nuisance is a form, the same in every cycle, as do
-        the forms of the laws that the model has beside its `base`, of their own force: the weight
-        counts these errors as noise of single steps.
-        """
-        r = self.evaluate(parameters) * self.entry_weight
-        laws = np.zeros(r.size) if base is None else self.evaluate(base) * self.entry_weight - r
-        # a sensor that others show to be louder is louder in the forces, too
-        sensors = [row for row, name in enumerate(self.rows) if name not in FORCE_ROWS]
-        forces = [row for row, name in enumerate(self.rows) if name in FORCE_ROWS]
-        learned, louder = replace(self, nuisances=None), np.ones(r.size)
-        for rows in (sensors, forces):
-            scale = dict(learned.noise_scale)
-            for row in rows:
-                change = np.maximum(learned._measure_change(row, r / louder), 1.0)
-                name = self.rows[row]
-                scale[name] = scale.get(name, np.ones(BAND_COUNT)) * np.sqrt(change)
-            learned = replace(learned, noise_scale=scale)
-            louder[: r.size - self._rest_entry_count] = learned._entry_noise / self._entry_noise
-        terms = self.nuisances
-        if terms is not None:
-            columns = terms.columns / louder[: terms.columns.shape[1]]
-            terms = replace(terms, columns=columns.astype(np.float32))
-        weights, expected = learned._measure_errors((laws / louder)[: learned.entry_row.size])
-        return replace(learned, weights=weights, expected_squares=expected, nuisances=terms)
-
-    def _measure_errors(self, laws: Float1D) -> tuple[dict[str, float], dict[str, float]]:
-        """Return the weights and the expected mean squares of the rows, by name.
-
-        `laws`, (entry,), are the forces of the laws beside the base, over the noise: the form of
-        a bumper's law is no error of the damper's.
-        """
-        read = (self.measured_entries * self.entry_weight) ** 2
-        unknown = UNKNOWN_ERROR_SHARE**2 * float(read.sum()) / self._count_different(read)
-        weights = dict.fromkeys((*self.rows, "rest"), math.sqrt(1.0 + unknown))
-        expected = dict.fromkeys(self.rows, weights["rest"] ** -2)
-        for row, name in enumerate(self.rows):
-            own = self.entry_row == row
-            if name not in FORCE_ROWS or not own.any():
-                continue
-            squares, forms = read[own], laws[own] ** 2
-            # laws that nearly cancel each other show no more of their form than what they explain
-            forms *= min(1.0, float(squares.sum()) / max(float(forms.sum()), 1e-300))
-            errors = UNKNOWN_ERROR_SHARE**2 * squares, FORM_ERROR_SHARE**2 * forms
-            parts = [float(of.sum()) / self._count_different(of) for of in errors]
-            weights[name] = math.sqrt(1.0 + sum(parts))
-            # a name must leave no more than instruments do, whatever form its law has
-            expected[name] = (1.0 + float(errors[0].mean())) / weights[name] ** 2
-        return weights, expected
-
-    def with_misfit(self, parameters: ParameterSet) -> "LogResiduals":
-        """Return the residuals with what a fitted model leaves counted as noise of single steps.
-
-        So the priors of the nuisances are not outvoted by a misfit that is no error of theirs. What
-        may remain where a residual is said to be noise, up to MAX_LEVEL, is no misfit.
-        """
-        squares, factors = self.evaluate(parameters) ** 2, {}
-        for row, name in enumerate(self.rows):
-            own = squares[self.entry_row == row]
-            noise = MAX_LEVEL * self.expected_squares.get(name, 1.0) * own.size
-            excess = max(float(own.sum()) - noise, 0.0)
-            factors[name] = math.sqrt(1.0 + excess / self._count_different(own))
-        factors["rest"] = max(factors.values())
-        weights = {name: factor * self.weights.get(name, 1.0) for name, factor in factors.items()}
-        return replace(self, weights=weights)
-
-    def _count_different(self, squares: Float1D) -> float:
-        """Return how many different errors entries with these squares are, (entry,).
-
-        As many as there are large ones that do not repeat in each cycle of a step.
-        """
-        steps = np.unique(self.signals.step[self.signals.step >= 0]).size
-        cycles = np.unique(self.sample_block[self._row_samples[0]]).size / max(steps, 1)
-        large = float(squares.sum() ** 2 / max(squares @ squares, 1e-300))
-        return max(large / (cycles if steps else 1.0), 1.0)
-
-    def _measure_change(self, row: int, r: Float1D) -> Float1D:
-        """Return the mean square over the noise that a row does not repeat, (band,); 1 if unknown.
-
-        Bands with too few components have the value of the whole row.
-        A motion that changes from cycle to cycle changes what a missing law leaves, by as large a
-        share as the force, or `CHANGE_ORDER` times that for a law of so high an order.
-        """
-        basis, facts = self.bases[row], np.flatnonzero(self.entry_row == row)
-        if basis is None or not facts.size:
-            return np.ones(BAND_COUNT)
-        sample, m = self.entry_sample[facts], self.motion()
-        measured = (m.label[sample] == Label.MEASURE) & (m.step[sample] >= 0)
-        variances: dict[int | None, list[float]] = {}  # of the steps, by band; None: of all bands
-        force = self.measured_entries[facts] * self.entry_weight[facts]
-        for number in np.unique(m.step[sample][measured]):
-            chosen = measured & (m.step[sample] == number)
-            cycles, index = np.unique(m.cycle[sample][chosen], return_inverse=True)
-            order = basis.order[chosen]
-            table = np.full((2, cycles.size, int(order.max(initial=0)) + 1), np.nan)
-            table[:, index, order] = r[facts[chosen]], force[chosen]
-            changes = np.diff(table, axis=1)
-            if np.isfinite(changes[0]).sum() < MIN_CHANGES:
-                continue
-            changed_force = 0.5 * float(np.nanmean(changes[1] ** 2))
-            share = changed_force / max(float(np.nanmean(table[1] ** 2)), 1e-300)
-            bands = np.zeros(table.shape[2], dtype=np.int64)
-            bands[order] = number_bands(basis.frequency_hz[chosen])
-            for band in (None, *np.unique(bands[order]).tolist()):
-                own = np.ones(bands.size, dtype=bool) if band is None else bands == band
-                change = changes[0][:, own]
-                if np.isfinite(change).sum() >= MIN_CHANGES:
-                    square = float(np.nanmean(table[0][:, own] ** 2))
-                    unsteady = CHANGE_ORDER**2 * share * square
-                    value = 0.5 * float(np.nanmean(change**2)) - unsteady
-                    variances.setdefault(band, []).append(value)
-        medians = {band: float(np.median(values)) for band, values in variances.items()}
-        whole = medians.pop(None, 1.0)
-        return np.array([medians.get(band, whole) for band in range(BAND_COUNT)])
 
     def _fact_noise(self, row: int, basis: BlockBasis) -> Float1D:
         """Return the rms noise of the components of a force row in N, (fact,)."""
@@ -991,39 +834,6 @@ class LogResiduals:
                 (mean - offset_sum - parameters.tare_error(self.log_number, quantity)) / sigma
             )
         return np.array(entries)
-
-
-def find_contact_thresholds(
-    signals: LogSignals, m: MeasuredMotion, least_n: float
-) -> tuple[float, float]:
-    """Return the force of the right and of the left cells in N above which there is contact.
-
-    Bumpers push: without a rest, what the cells read below zero shows their noise.
-    """
-    squares = np.nan_to_num(m.acc[m.moving] ** 2)
-    inertia_n = m.mass_kg * math.sqrt(squares.mean()) if squares.size else 0.0
-    least = max(least_n, MIN_CONTACT_SHARE * inertia_n)
-    thresholds = []
-    for push, rms in ((m.right, m.noise.right), (m.left, m.noise.left)):
-        below = push[m.moving & (push < 0.0)] if not signals.rest_noise else push[:0]
-        shown = -float(np.median(below)) / MEDIAN_OF_NORMAL if below.size else 0.0
-        thresholds.append(max(least, CONTACT_NOISE_FACTOR * max(rms, shown)))
-    return thresholds[0], thresholds[1]
-
-
-def read_contact(
-    signals: LogSignals, m: MeasuredMotion, thresholds_n: tuple[float, float]
-) -> npt.NDArray[np.int8]:
-    """Return the contact of right and left that the load cells show, (2, sample): 1 or 0."""
-    sides = []
-    shortest = max(
-        MIN_CONTACT_SAMPLES,
-        math.ceil(MIN_CONTACT_FILTER_CYCLES * m.rate_hz / signals.filter_hz) + 1,
-    )
-    for push, threshold, gap in zip((m.right, m.left), thresholds_n, m.gaps_m, strict=True):
-        idle = float(np.median(push[~m.moving])) if gap > 0 and (~m.moving).any() else 0.0
-        sides.append(binary_opening(push - idle > threshold, np.ones(shortest)))
-    return np.array(sides, dtype=np.int8)
 
 
 def measure_level(

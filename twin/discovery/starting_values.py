@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D
+from twin.discovery.contact import find_contact_thresholds, read_contact
 from twin.discovery.motion import MeasuredMotion
 from twin.discovery.parameters import BASE_PARAMETERS, GapKey, ParameterKey, ParameterSet
-from twin.discovery.residuals import LogResiduals, find_contact_thresholds, read_contact
+from twin.discovery.residuals import LogResiduals
 from twin.discovery.selection import mean_square
 from twin.discovery.signals import LogSignals
 
