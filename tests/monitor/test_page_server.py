@@ -341,6 +341,21 @@ def test_wrong_code_is_logged_and_slowed_and_a_right_one_is_not(
     assert "aaaa" not in caplog.text
 
 
+def test_wrong_codes_in_great_number_shut_nobody_out(
+    lab: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(page_server, "WRONG_CODE_S", 0.1)
+    with serving(own(lab, "anna")) as page, ThreadPoolExecutor(100) as threads:
+        wrong = [threads.submit(page.get, "/events", **as_person("aaaa-bbbb")) for _ in range(100)]
+        time.sleep(0.5)
+        started_s = time.monotonic()
+        assert page.get("/").status == 200
+        assert time.monotonic() - started_s < 0.3
+        statuses = [answer.result().status for answer in wrong]
+    assert {*statuses} == {401, 429}
+    assert statuses.count(401) >= page_server.MAX_WRONG_CODES
+
+
 @pytest.mark.parametrize(
     ("body", "headers", "status"),
     [
