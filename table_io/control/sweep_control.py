@@ -6,8 +6,8 @@ the delay of window and queue cannot make the loop oscillate. The same is done w
 each limited channel to the level, from which the level is reduced before the limit is reached.
 
 A ratio is extrapolated as its difference from what is known of it (the response of the loop check,
-an earlier pass, the twin of the specimen) over ln f, by the median slope of the last points: one
-jump of the specimen does not tilt it.
+an earlier pass, the twin of the specimen), or as itself where that is the straighter one, over
+ln f, by the median slope of the last points: one jump of the specimen does not tilt it.
 """
 
 import math
@@ -40,25 +40,42 @@ def combine_levels(config: SweptSine, amplitudes: Mapping[str, float], w: float)
 
 
 def extrapolate_ratio(points: Sequence[tuple[float, float]], known: Curve, ln_f: float) -> float:
-    """Return ln(ratio) at ln f from measured (ln f, ln(ratio)), oldest first, and what is known."""
+    """Return ln(ratio) at ln f from measured (ln f, ln(ratio)), oldest first, and what is known.
+
+    What is known counts as far as the last points differ from it more evenly than from a constant:
+    an earlier pass may have been on another branch of the specimen.
+    """
     if not points:
         return known(ln_f)
+    curves = [(known, _list_slopes(points, known)), (_flat, _list_slopes(points, _flat))]
+    curve, slopes = curves[0]
+    if len(slopes) >= SLOPE_POINTS - 1:
+        curve, slopes = min(curves, key=lambda entry: max(entry[1]) - min(entry[1]))
+        slope = min(max(float(np.median(slopes)), -MAX_SLOPE), MAX_SLOPE)
+    else:
+        slope = 0.0
+    at, value = points[-1]
+    return curve(ln_f) + value - curve(at) + slope * (ln_f - at)
+
+
+def _flat(_: float) -> float:
+    return 0.0
+
+
+def _list_slopes(points: Sequence[tuple[float, float]], known: Curve) -> list[float]:
+    """Return the slopes over ln f of the last points, less what is known of them."""
     last = [(at, value - known(at)) for at, value in points[-SLOPE_POINTS:]]
-    slopes = [
+    return [
         (after - before) / (right - left)
         for (left, before), (right, after) in pairwise(last)
         if right != left
     ]
-    slope = float(np.median(slopes)) if len(slopes) >= SLOPE_POINTS - 1 else 0.0
-    slope = min(max(slope, -MAX_SLOPE), MAX_SLOPE)
-    at, value = last[-1]
-    return known(ln_f) + value + slope * (ln_f - at)
 
 
 def make_curve(points: Sequence[tuple[float, float]]) -> Curve:
     """Return ln(ratio) over ln f through points, constant outside; 0 of none."""
     if not points:
-        return lambda _: 0.0
+        return _flat
     table = np.array(sorted(points))
     return lambda ln_f: float(np.interp(ln_f, table[:, 0], table[:, 1]))
 

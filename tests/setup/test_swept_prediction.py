@@ -7,12 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from table_io.config.base import PROFILES_DIR
+from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.excitation.swept_sine import PredictedSweep, SweptSine
+from table_io.config.profile import Profile
 from table_io.records import SweepLevel
 from table_io.sequencer.swept_sine import foresee_ratio
+from tests.builders.rigs import LAB_TEXT, SECOND_ACC, TEMPERATURE
 from tests.builders.sessions import play_session
 from twin.setup.run_config import RunConfig, read_run_config
+from twin.setup.swept_prediction import reduce_before_excess
 
 GRAVITY_M_S2 = 9.80665
 LIMIT_G = 0.09
@@ -72,6 +75,42 @@ def test_run_plays_the_predicted_notch(config: RunConfig) -> None:
         mass.append(level.amplitudes[level.channels.index("mass_acc_m_s2")])
     assert np.abs(np.array(ratios) - 1.0).max() < 0.05
     assert max(mass) < 1.03 * LIMIT_G * GRAVITY_M_S2
+
+
+def test_limits_of_own_channels_are_predicted_where_the_twin_knows_them(
+    config: RunConfig, tmp_path: Path
+) -> None:
+    """The second accelerometer is mounted the other way round; no twin knows the temperature."""
+    own = PROFILE.replace('"mass_acc_m_s2"', f'"{SECOND_ACC}"').replace(
+        "limits = [", f'limits = [{{ channel = "{TEMPERATURE}", limit = 80.0, action = "notch" }}, '
+    )
+    (tmp_path / "lab.toml").write_text(LAB_TEXT, encoding="utf-8")
+    path = tmp_path / "own.toml"
+    path.write_text(own.replace('"simulated"', f'"{tmp_path / "lab.toml"}"'), encoding="utf-8")
+    swept, canonical = read_run_config(path).profile.swept_sine, config.profile.swept_sine
+    assert swept is not None
+    assert canonical is not None
+    assert swept.predicted is not None
+    assert canonical.predicted is not None
+    assert SECOND_ACC in swept.predicted.channels
+    assert TEMPERATURE not in swept.predicted.channels
+    np.testing.assert_allclose(swept.predicted.table[:, 2], canonical.predicted.table[:, 2])
+
+
+def test_level_before_a_jump_leaves_room_for_what_the_jump_does_to_the_table() -> None:
+    """The mass comes to 0.97 of its limit at 2 Hz: no excess, unless it jumps there."""
+    limit = LIMIT_G * GRAVITY_M_S2
+    rows = np.array([(0.0, 0.01 * k, 1.0, 0.97 * limit) for k in range(150, 250)])
+    profile = parse_toml(PROFILE, Profile, "notched.toml")
+    assert reduce_before_excess(PredictedSweep(("mass_acc_m_s2",), rows), profile) is None
+    rows[:50, 3] *= 0.5
+    reduced = reduce_before_excess(PredictedSweep(("mass_acc_m_s2",), rows), profile)
+    assert reduced is not None
+    level = 0.96 / (1.1 * 0.97)
+    assert reduced.level_m_s2(0, 1.9) == pytest.approx(level)
+    assert reduced.level_m_s2(0, 2.0) == pytest.approx(level)
+    assert reduced.level_m_s2(0, 1.8) == pytest.approx(1.0)
+    assert reduced.level_m_s2(0, 2.1) == pytest.approx(1.0)
 
 
 def test_prediction_travels_with_the_profile_and_is_not_computed_again(config: RunConfig) -> None:

@@ -8,26 +8,34 @@ profile, uses the predicted ratios ahead of its own measurements, and reports bo
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Protocol
 
 import numpy as np
 
 from table_io.block import Block
-from table_io.config.excitation.swept_sine import TABLE_ACCELERATION, PredictedSweep, SweptSine
+from table_io.config.excitation.swept_sine import (
+    PREDICTION_COLUMNS,
+    TABLE_ACCELERATION,
+    PredictedSweep,
+    SweptSine,
+)
 from table_io.config.profile import NOTCH, LoopCheckConfig, Profile
 from table_io.config.rig import RigConfig
-from table_io.control.sweep_control import LIMIT_SHARE
+from table_io.control.sweep_control import LIMIT_SHARE, MIN_RATIO
 from table_io.records import RunStart, RunStop, SweepLevel
 from table_io.sequencer.procedure import advance_test, make_test_plan, start_test
-from twin.compare import pipeline
+from twin.compare import PREDICTED_CHANNELS, pipeline
+from twin.compare.extra_channels import predict_channel
 from twin.transport.codec import Item
 
 BLOCK_S = 0.05  # simulated at once: shorter than the horizon of a decision
-POINTS_PER_OCTAVE = 48  # of a prediction
+POINTS_PER_OCTAVE = 96  # of a prediction: every level, up to 2 octaves a minute at 3 Hz
 MAX_PREDICTIONS = 4
 MAX_LIMIT_RATIO = 1.015  # of a limit, from which a prediction is repeated
 JUMP_SPAN = 0.06  # in ln f before an excess, within which the level is reduced for it
+MAX_STEADY_CHANGE = 0.4  # in ln(response over level) from one level to the next: beyond is a jump
+JUMP_POINTS = 4  # levels from a jump on, in which its largest response is measured
 PREDICTION_FILE = "prediction.csv"
 TWIN_PREFIX = "free/"
 
@@ -65,7 +73,10 @@ def generate_swept_twin(
     yield start
     twin, begun = pipeline.start_pipeline(setup)
     yield from begun
-    state = start_test(make_test_plan(_keep_predicted(profile, config.rig), config.rig))
+    extra = setup.twin.extra_channels
+    own = tuple(name for name in PREDICTED_CHANNELS if name not in start.channels)
+    known = (*start.channels, *own, *(channel.name for channel in extra))
+    state = start_test(make_test_plan(_keep_predicted(profile, known), config.rig))
     index, count = 0, round(BLOCK_S * rate_hz)
     rest = math.ceil(profile.acquisition.rest_s * rate_hz)
     while not state.is_finished or index < state.drive.rest_start + rest:
@@ -78,23 +89,20 @@ def generate_swept_twin(
         twin, items = pipeline.step(setup, twin, block)
         yield from items
         answers = [item for item in items if isinstance(item, Block) and item.index == index]
-        names = [name for name in answers[0].channels if name.startswith(TWIN_PREFIX)]
-        names = [n for n in names if n.removeprefix(TWIN_PREFIX) not in start.channels]
-        rows = [answers[0].channel(name) for name in names]
-        known = (*start.channels, *(name.removeprefix(TWIN_PREFIX) for name in names))
-        measured = Block("meas", index, rate_hz, known, np.array([*values, *rows]), *labels)
+        sources = dict(zip(start.channels, values, strict=True))
+        sources |= {name: answers[0].channel(f"{TWIN_PREFIX}{name}") for name in own}
+        rows = [*sources.values(), *(predict_channel(channel, sources) for channel in extra)]
+        measured = Block("meas", index, rate_hz, known, np.array(rows), *labels)
         state, records = advance_test(state, measured)
         yield from records
         index += count
     yield RunStop(index, "complete", "the whole sweep was simulated", ("idle", "at rest"))
 
 
-def _keep_predicted(profile: Profile, rig: RigConfig) -> Profile:
+def _keep_predicted(profile: Profile, names: Collection[str]) -> Profile:
     """Return the profile without loop check, with what the twin predicts of its channels."""
     swept = profile.swept_sine
     assert swept is not None
-    names = {"table_acc_m_s2", "table_disp_m", "mass_acc_m_s2", "mass_disp_m", "rel_disp_m"}
-    names |= {channel.channel.name for channel in rig.extra_channels}
     control = tuple(name for name in swept.control_channels if name in names)
     excitation = swept.model_copy(update={"control_channels": control or (TABLE_ACCELERATION,)})
     return profile.model_copy(
@@ -116,19 +124,41 @@ def predict_notch(config: TwinTest, swept: SweptSine) -> PredictedSweep:
         items = generate_swept_twin(config, profile=profile)
         measured = [item for item in items if isinstance(item, SweepLevel)]
         levels = PredictedSweep.from_levels(swept, measured, POINTS_PER_OCTAVE)
-        limits = {
-            entry.channel: MAX_LIMIT_RATIO * entry.limit_si
-            for entry in profile.limits
-            if entry.action == NOTCH and entry.channel in levels.channels
-        }
-        reduced = levels.reduce_before_excess(limits, LIMIT_SHARE, JUMP_SPAN) if limits else levels
-        if attempt == MAX_PREDICTIONS - 1 or np.array_equal(reduced.table, levels.table):
+        # All of them: the largest response to a jump lasts for a cycle or two.
+        reduced = reduce_before_excess(PredictedSweep.from_levels(swept, measured), profile)
+        if attempt == MAX_PREDICTIONS - 1 or reduced is None:
             break
         excitation = swept.model_copy(
             update={"prediction": PREDICTION_FILE, "files": {PREDICTION_FILE: reduced.to_csv()}}
         )
         profile = config.profile.model_copy(update={"excitation": excitation})
     return levels
+
+
+def reduce_before_excess(levels: PredictedSweep, profile: Profile) -> PredictedSweep | None:
+    """Return a prediction with lower levels where a channel goes beyond its limit; None if none do.
+
+    There, and within JUMP_SPAN before it, the level is at most what would have left LIMIT_SHARE of
+    the limit: a jump of the specimen is met with the level that it needs afterwards. At a jump the
+    level of a table that is shaken by it is off by as much as raises no alarm yet, and counts so.
+    """
+    table, ln_f = levels.table.copy(), np.log(levels.table[:, 1])
+    excess = np.zeros(len(table))
+    for entry in profile.limits:
+        if entry.action == NOTCH and entry.channel in levels.channels:
+            response = table[:, len(PREDICTION_COLUMNS) + levels.channels.index(entry.channel)]
+            ratio = np.maximum(response / table[:, 2], MIN_RATIO)
+            change = np.abs(np.diff(np.log(ratio), prepend=math.nan))
+            jumps = np.convolve(change > MAX_STEADY_CHANGE, np.ones(JUMP_POINTS))[: len(table)]
+            margin = np.where(jumps > 0, 1.0 + profile.protection.alarm, 1.0)
+            excess = np.maximum(excess, margin * response / entry.limit_si)
+    beyond = np.flatnonzero(excess > MAX_LIMIT_RATIO).tolist()
+    for row in beyond:
+        before = (np.arange(len(table)) <= row) & (table[:, 0] == table[row, 0])
+        before &= np.abs(ln_f - ln_f[row]) <= JUMP_SPAN
+        highest = LIMIT_SHARE * levels.table[row, 2] / excess[row]
+        table[before, 2] = np.minimum(table[before, 2], highest)
+    return PredictedSweep(levels.channels, table) if beyond else None
 
 
 def attach_prediction(config: TwinTest) -> str:

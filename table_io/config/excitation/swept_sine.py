@@ -7,7 +7,7 @@ with action "notch" reduces it. After the passes the table may dwell at the reso
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import ClassVar, Literal
@@ -248,7 +248,7 @@ class PredictedSweep:
 
     @classmethod
     def from_levels(
-        cls, config: SweptSine, levels: Sequence[SweepLevel], per_octave: int
+        cls, config: SweptSine, levels: Sequence[SweepLevel], per_octave: float = math.inf
     ) -> "PredictedSweep":
         """Return the prediction of simulated levels, thinned to so many points an octave."""
         rows: list[tuple[float, ...]] = []
@@ -307,25 +307,3 @@ class PredictedSweep:
             return math.nan
         row = 2 + self.channels.index(channel)
         return float(np.interp(ln_f, curve[0], curve[row] - curve[1]))
-
-    def reduce_before_excess(
-        self, limits: Mapping[str, float], share: float, span: float
-    ) -> "PredictedSweep":
-        """Return the prediction with lower levels where a channel goes beyond its limit, SI.
-
-        There, and within `span` of ln f before it, the level is at most what would have left this
-        share of the limit: a jump of the specimen is met with the level that it needs afterwards.
-        """
-        table, ln_f = self.table.copy(), np.log(self.table[:, 1])
-        columns = [
-            (len(PREDICTION_COLUMNS) + self.channels.index(name), limit)
-            for name, limit in limits.items()
-        ]
-        for row in range(len(table)):
-            excess = max(self.table[row, column] / limit for column, limit in columns)
-            if excess > 1.0:
-                before = (np.arange(len(table)) <= row) & (table[:, 0] == table[row, 0])
-                before &= np.abs(ln_f - ln_f[row]) <= span
-                highest = share * self.table[row, 2] / excess
-                table[before, 2] = np.minimum(table[before, 2], highest)
-        return PredictedSweep(self.channels, table)
