@@ -342,20 +342,24 @@ def fit_table(
     """
     names = tuple(bounds)
     typical, low, high = (np.array(column) for column in zip(*bounds.values(), strict=True))
+    evaluated: dict[bytes, Float1D] = {}  # by the values: a Jacobian begins at one of them
+
+    def simulate(values: Float1D) -> Float1D:
+        return problem.compute_residuals(build_parameters(names, values, problem))
 
     def residuals(values: Float1D) -> Float1D:
-        return problem.compute_residuals(build_parameters(names, values, problem))
+        return evaluated.setdefault(values.tobytes(), simulate(values))
 
     def slopes(values: Float1D) -> Float2D:
         """Return the Jacobian by differences whose steps do not vanish with a parameter."""
-        trials = np.tile(values, (values.size + 1, 1))
+        trials = np.tile(values, (values.size, 1))
         for index, size in enumerate(np.maximum(np.abs(values), typical)):
             step = DIFFERENCE_STEP * size
-            trials[index + 1, index] += -step if values[index] + step > high[index] else step
-        before, *after = map_in_threads(residuals, list(trials))
+            trials[index, index] += -step if values[index] + step > high[index] else step
+        before = evaluated[values.tobytes()]
         jacobian = np.empty((problem.block.size, values.size))
-        for index, changed in enumerate(after):
-            jacobian[:, index] = (changed - before) / (trials[index + 1, index] - values[index])
+        for index, changed in enumerate(map_in_threads(simulate, list(trials))):
+            jacobian[:, index] = (changed - before) / (trials[index, index] - values[index])
         return jacobian
 
     values = np.clip([start[name] for name in names], low, high)
