@@ -1,6 +1,7 @@
 """`table-twin` and `table-drive` as a user runs them on the simulated hydraulic table."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,10 @@ from table_io.config.excitation import History
 from table_io.config.profile import load_profile
 from table_io.errors import InputError
 from tests.command_line import call_main
+from tests.earthquakes.hydraulic_rig import RATE_HZ, make_random_motion
 from tests.input_errors import raises_input_error
 from twin.earthquakes import task
+from twin.earthquakes.drive_computation import compute_command, measure_error
 from twin.earthquakes.result import load_table_twin
 from twin.earthquakes.table_model import TableModel, TableParameters
 from twin.recording.reader import read_recording
@@ -99,6 +102,36 @@ def test_an_ideal_table_plays_the_target_and_its_specimen_knows_no_drive(folder:
         load_profile(folder / name / "profile.toml")[0].plan.history_m for name in ("out", "again")
     ]
     np.testing.assert_allclose(drives[1], drives[0], atol=5e-6)
+
+
+def test_what_the_twin_rings_above_the_band_is_taken_out_as_far_as_it_was_judged(
+    folder: Path,
+) -> None:
+    """A response spectrum at the end of the band answers to the ringing of the oil column."""
+    parameters = TableParameters(
+        velocity_feedforward=0.2, oil_hz=26.9, friction_n=1500.0, static_excess_n=450.0,
+        presliding_m=2.6e-5, pressure_feedback_s=0.0034,
+    )  # fmt: skip
+    model, band_hz = TableModel(2000.0, parameters), (0.3, 18.0)
+    target = make_random_motion(12.0, (0.5, 12.0), 0.5, seed=3)
+    errors = []
+    for highest_hz in (0.0, 36.0):
+        drive = compute_command(model, target, RATE_HZ, band_hz, highest_hz=highest_hz)
+        achieved = model.simulate(drive.command_m, RATE_HZ)[0]
+        errors.append(measure_error(achieved, target, RATE_HZ, (0.3, 36.0)))
+        assert drive.expected_error == pytest.approx(
+            measure_error(achieved, target, RATE_HZ, band_hz)
+        )
+    assert errors[1] < 0.3 * errors[0]
+    powers = []
+    for judged_hz in ("10.0", "40.0"):
+        (folder / "table.toml").write_text(TWIN.replace("[0.5, 10.0]", f"[0.5, {judged_hz}]"))
+        assert compute(folder) == 0
+        command_m = load_profile(folder / "out" / "profile.toml")[0].plan.history_m
+        hz = np.fft.rfftfreq(command_m.size, 1e-3)
+        powers.append(np.sum(np.abs(np.fft.rfft(command_m)[(hz > 14.0) & (hz < 18.0)]) ** 2))
+        shutil.rmtree(folder / "out")
+    assert powers[1] > 100.0 * powers[0]
 
 
 @pytest.mark.slow  # 15 s

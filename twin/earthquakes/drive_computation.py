@@ -48,27 +48,29 @@ def compute_command(
     rate_hz: float,
     band_hz: tuple[float, float],
     reaction_n: Float1D | None = None,
+    highest_hz: float = 0.0,
 ) -> TwinDrive:
     """Compute the command for a target displacement in m, (sample,), at rest at both ends.
 
-    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion.
+    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion. Up
+    to `highest_hz` what the twin adds above the band is taken out too: its oil column rings.
     """
-    command = compute_correction(target_m, model, rate_hz, band_hz)
-    best, best_error, step = command, math.inf, 1.0
+    wide_hz = band_hz[0], max(band_hz[1], highest_hz)
+    best, best_error, lacking, step = np.zeros(target_m.size), math.inf, target_m, 1.0
     for _ in range(MAX_ROUNDS):
+        command = best + step * compute_correction(lacking, model, rate_hz, wide_hz)
         achieved = model.simulate(command, rate_hz, reaction_n)[0]
-        error = measure_error(achieved, target_m, rate_hz, band_hz)
+        error = measure_error(achieved, target_m, rate_hz, wide_hz)
         if error >= best_error:
             step *= 0.5
             if step < 0.2:
                 break
         else:
-            if best_error - error < LEAST_GAIN * best_error:
-                best, best_error = command, error
+            gain, best, best_error = best_error - error, command, error
+            lacking = target_m - achieved
+            if gain < LEAST_GAIN * (gain + error):
                 break
-            best, best_error, lacking = command, error, target_m - achieved
-        command = best + step * compute_correction(lacking, model, rate_hz, band_hz)
-    return TwinDrive(best, best_error)
+    return TwinDrive(best, measure_error(target_m - lacking, target_m, rate_hz, band_hz))
 
 
 def compute_correction(

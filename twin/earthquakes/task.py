@@ -57,7 +57,7 @@ from twin.earthquakes.table_response import CROSSOVER_HZ, BandProjection, Predic
 from twin.recording.reader import Recording
 from twin.results.best_linear import COMMAND, estimate_best_linear
 from twin.results.recordings import build_provenance, open_recording
-from twin.results.tracking import find_band
+from twin.results.tracking import BAND_WIDENING, find_band
 from twin.setup.run_config import RunConfig, build_run_config
 from twin.setup.unpaced import generate_ideal_twin
 from twin.system.files import hash_file
@@ -225,8 +225,10 @@ class DriveComputation:
         expected_error = None
         if after is None:
             report("computing the drive on the twin of the table")
+            judged = self.twin.judgement.runs if self.twin.judgement else ()
+            highest_hz = min([BAND_WIDENING * self.band_hz[1], *(run.band_hz[1] for run in judged)])
             computed = compute_command(
-                self.model, self.target_m, rate_hz, self.band_hz, self.reaction_n
+                self.model, self.target_m, rate_hz, self.band_hz, self.reaction_n, highest_hz
             )
             command, expected_error = computed.command_m, computed.expected_error
         else:
