@@ -68,6 +68,10 @@ class HydraulicTableConfig(ConfigModel):
     friction_slope_1_m: Slope = Field(
         0.0, description="Relative rise of the friction along the stroke, at its centre."
     )
+    friction_drift_1_s: Finite = Field(
+        0.0,
+        description="Relative rise of the friction with time; warm oil: it falls.",
+    )
     coupling_play_mm: NonNegative = Field(
         0.0, description="Play between piston and table, from stop to stop."
     )

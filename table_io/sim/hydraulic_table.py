@@ -22,6 +22,7 @@ What a worn or badly adjusted table has in addition; each is absent where its ke
     Q -> Q (1 + a tanh(x / x_a))                                           flow gains differ
     g -> g (1 + b) for q' > 0, g (1 - b) for q' < 0                        friction by direction
     g -> g max(1 + tanh(s q), 0.05)                                        friction along the stroke
+    F -> F max(1 + r t, 0.05)                           friction that drifts as the oil warms up
     m_p y_p'' = A p - N, N = k_p d + c_p d' with d = y_p - y beyond +-j/2  play j of the coupling
     q -> (1 + n) q, then twice 1 / (1 + s t_n / 2), in e                   transducer of the stroke
     m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                      mass attached to the frame
@@ -42,16 +43,16 @@ from table_io.sim.config import HydraulicTableConfig
 # rate in 1/s, bristles in m, frame in m and m/s.
 P, P_LOW, SPOOL, SPOOL_RATE, BRISTLE, YF, VYF = 15, 16, 17, 18, 19, 20, 21
 HYDRAULIC_STATE_SIZE = 22
-# States of a table with play, hysteresis, a lag of its transducer or an attached mass: piston and
-# attached mass in m and m/s, the two filters of the stroke in m, the valve's input.
-YP, VYP, YA, VYA, READ_1, READ_2, INPUT = 22, 23, 24, 25, 26, 27, 28
-EXTENDED_HYDRAULIC_STATE_SIZE = 29
+# States of a table with play, hysteresis, a lag of its transducer, an attached mass or drift:
+# piston and attached mass in m and m/s, two filters of the stroke in m, valve's input, time in s.
+YP, VYP, YA, VYA, READ_1, READ_2, INPUT, AGE = 22, 23, 24, 25, 26, 27, 28, 29
+EXTENDED_HYDRAULIC_STATE_SIZE = 30
 OVERLAP_EDGE_RATIO = 6.0  # of the overlap over the rounding of its edges
 HYSTERESIS_LAG_S = 2e-4  # with which play in the valve's input is followed
 FLOW_ROUNDING = 1e-4  # opening over which the gain of the flow changes
 PISTON_DAMPING = 0.3  # damping ratio of the piston against its stops in the coupling
 MAX_HYDRAULIC_SUBSTEP_S = 3.2e-5  # the bristles relax in 40 us at 0.5 m/s; stable below 110 us
-LEAST_STROKE_SHARE = 0.05  # of the friction, however it falls along the stroke
+LEAST_FRICTION_SHARE = 0.05  # of the friction, however it falls along the stroke or with time
 MAX_RELAXATION_1_S = 1.0 / MAX_HYDRAULIC_SUBSTEP_S  # of bristles under little friction
 
 
@@ -85,6 +86,7 @@ class HydraulicCoefficients(NamedTuple):
     flow_asymmetry: float = 0.0
     friction_asymmetry: float = 0.0
     friction_slope: float = 0.0  # 1/m
+    friction_drift: float = 0.0  # 1/s
     play: float = 0.0  # m
     piston_mass: float = 1.0
     stop_stiffness: float = 0.0
@@ -97,8 +99,10 @@ class HydraulicCoefficients(NamedTuple):
     @property
     def state_size(self) -> int:
         """Return the number of states of plant and table."""
-        further = self.hysteresis or self.play or self.reading_lag or self.attached_mass
-        return EXTENDED_HYDRAULIC_STATE_SIZE if further else HYDRAULIC_STATE_SIZE
+        extending = (
+            self.hysteresis, self.play, self.reading_lag, self.attached_mass, self.friction_drift,
+        )  # fmt: skip
+        return EXTENDED_HYDRAULIC_STATE_SIZE if any(extending) else HYDRAULIC_STATE_SIZE
 
     def with_supply(self, share: float) -> "HydraulicCoefficients":
         """Return the coefficients with this fraction of the supply pressure; gains stay."""
@@ -137,6 +141,7 @@ def make_coefficients(config: HydraulicTableConfig, table_mass_kg: float) -> Hyd
         flow_asymmetry=config.flow_asymmetry,
         friction_asymmetry=config.friction_asymmetry,
         friction_slope=config.friction_slope_1_m,
+        friction_drift=config.friction_drift_1_s,
         play=config.coupling_play_mm * 1e-3,
         piston_mass=config.piston_mass_kg,
         stop_stiffness=config.coupling_stiffness_n_m,
@@ -180,6 +185,17 @@ def _press_stops(offset, speed, oil):  # type: ignore[no-untyped-def]
 
 
 @inline_jit
+def _find_sliding_friction(s, stroke, speed, oil):  # type: ignore[no-untyped-def]
+    """Return the friction in steady motion in N, without the viscous one."""
+    g = oil.fc + (oil.fs - oil.fc) * math.exp(-((speed / oil.vs) ** 2))
+    if oil.friction_asymmetry != 0.0:
+        g *= 1.0 + oil.friction_asymmetry if speed > 0.0 else 1.0 - oil.friction_asymmetry
+    if oil.friction_slope != 0.0:
+        g *= max(1.0 + math.tanh(oil.friction_slope * stroke), LEAST_FRICTION_SHARE)
+    return g
+
+
+@inline_jit
 def write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: ignore[no-untyped-def]
     """Write the rates of oil, valve, bristles and frame; return the force on the table in N.
 
@@ -187,11 +203,7 @@ def write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: 
     """
     stroke, speed = y - s[YF], vy - s[VYF]
     # Friction. Its force on the table opposes the speed of the piston in the cylinder.
-    g = oil.fc + (oil.fs - oil.fc) * math.exp(-((speed / oil.vs) ** 2))
-    if oil.friction_asymmetry != 0.0:
-        g *= 1.0 + oil.friction_asymmetry if speed > 0.0 else 1.0 - oil.friction_asymmetry
-    if oil.friction_slope != 0.0:
-        g *= max(1.0 + math.tanh(oil.friction_slope * stroke), LEAST_STROKE_SHARE)
+    g = _find_sliding_friction(s, stroke, speed, oil)
     rate[BRISTLE] = 0.0
     friction = oil.viscous * speed
     if g > 0.0:
@@ -201,6 +213,9 @@ def write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: 
             if relaxation > MAX_RELAXATION_1_S:
                 rate[BRISTLE] *= MAX_RELAXATION_1_S / relaxation
         friction += oil.s0 * s[BRISTLE] + oil.s1 * rate[BRISTLE]
+    if oil.friction_drift != 0.0:
+        friction *= max(1.0 + oil.friction_drift * s[AGE], LEAST_FRICTION_SHARE)
+        rate[AGE] = 1.0
     # Controller: stroke, feed-forward and the fast part of the load pressure.
     velocity = oil.gain * (command - _read_stroke(s, stroke, oil, rate))
     velocity += oil.feedforward * command_rate

@@ -28,6 +28,7 @@ SIZES: dict[str, dict[str, tuple[float, float]]] = {
     "dead_band": {"valve_overlap_percent": (0.1, 0.8)},
     "valve_hysteresis": {"valve_hysteresis_percent": (0.15, 0.8)},
     "flow_asymmetry": {"flow_asymmetry": (0.08, 0.3)},
+    "friction_drift": {"friction_drift_1_s": (0.003, 0.015)},
     "friction_asymmetry": {"friction_asymmetry": (0.1, 0.4)},
     "friction_slope": {"friction_slope_1_m": (20.0, 80.0)},
     "backlash": {"coupling_play_mm": (0.02, 0.15)},
@@ -82,8 +83,8 @@ def draw_table(rng: np.random.Generator, effect: str = "") -> PlantedTable:
     }
     for key, (low, high) in SIZES.get(effect, {}).items():
         size = math.exp(rng.uniform(math.log(low), math.log(high)))
-        signed = effect in ("flow_asymmetry", "friction_asymmetry", "friction_slope",
-                            "transducer_gain")  # fmt: skip
+        signed = effect in ("flow_asymmetry", "friction_drift", "friction_asymmetry",
+                            "friction_slope", "transducer_gain")  # fmt: skip
         hydraulic[key] = size * (rng.choice([-1.0, 1.0]) if signed else 1.0)
     return PlantedTable(hydraulic, rng.uniform(1.0, 4.0), int(rng.integers(1, 1_000_000)), effect)
 

@@ -74,6 +74,7 @@ SIZES: dict[str, dict[str, float]] = {
 OPEN_M_S = 63e-3 / 60.0 * math.sqrt(3.0) / 20e-4
 PLANTED: dict[str, dict[str, float]] = {
     "dead_band": {"valve_overlap_percent": 100.0 * 3e-3 / OPEN_M_S},
+    "friction_drift": {"friction_drift_1_s": 0.5},
     "valve_hysteresis": {"valve_hysteresis_percent": 100.0 * 1.2e-3 / OPEN_M_S},
     "flow_asymmetry": {"flow_asymmetry": 0.05},
     "friction_asymmetry": {"friction_asymmetry": 0.25},
