@@ -12,7 +12,7 @@ from twin.discovery import evidence
 from twin.discovery.candidates import Candidate
 from twin.discovery.evidence import build_evidence
 from twin.discovery.law_terms import make_law_candidate
-from twin.discovery.parameters import ParameterSet
+from twin.discovery.parameters import DAMPING, ParameterSet
 from twin.discovery.residuals import LogResiduals
 from twin.evidence.linear import (
     EFFECT_SHARE,
@@ -131,3 +131,36 @@ def test_a_place_that_only_noise_reaches_is_no_unknown_force(
     prepared = prepare_bare_log()
     linear = build_evidence(prepared.problem.log_residuals, prepared.parameters, (), {})
     assert linear.places["here"].size == 1
+
+
+def test_a_hat_without_samples_is_no_unknown_force(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What rounding leaves of it had an evidence of 10^24 on a measured motion."""
+
+    def compute_forces(residuals: LogResiduals, parameters: ParameterSet) -> dict[str, list]:
+        ones = np.ones((3, residuals.motion().u.size))
+        return {"here": [1e-36 * ones, ones]}
+
+    monkeypatch.setattr(evidence, "compute_stranger_forces", compute_forces)
+    prepared = prepare_bare_log()
+    linear = build_evidence(prepared.problem.log_residuals, prepared.parameters, (), {})
+    assert linear.places["here"].size == 1
+    assert linear.measure_set([], "here") < 10.0
+
+
+def test_what_an_effect_stood_for_is_free_where_the_effect_is_gone() -> None:
+    """A dashpot with a short relaxation may take all damping: without it, the damping is no gain.
+
+    Held at 0, as where noise alone presses it there, every set without the dashpot was excluded.
+    """
+    prepared = prepare_bare_log()
+    problem, fitted = prepared.problem, prepared.parameters
+    drained = fitted.with_values({DAMPING: 0.0})
+    assert drained.values[DAMPING] == next(p for p in fitted.free if p.key == DAMPING).low
+    library = [each for each in problem.library if each.name == "maxwell_damper"]
+    gains = [
+        max(linear.measure_gain([column]) for column, _ in enumerate(linear.variants))
+        for linear in (
+            build_evidence(problem.log_residuals, start, library, {}) for start in (fitted, drained)
+        )
+    ]
+    assert gains[1] < gains[0] + 10.0

@@ -278,6 +278,9 @@ def absorb_base(
     scores = -reduced[:-1, -1] * own_scale
     # columns that are noise, or that the base imitates, have nothing left
     is_left = np.diag(reduced)[:-1] > MIN_INFORMATION_SHARE
+    for of_place in places.values():  # a hat without samples is rounding alone
+        own = own_scale[of_place]
+        is_left[of_place] &= own**2 > MIN_INFORMATION_SHARE * own.max(initial=0.0) ** 2
     products[~is_left], products[:, ~is_left], scores[~is_left] = 0.0, 0.0, 0.0
     rest[:-1] *= is_left[:, None]
     usable = np.where(is_left, own_scale, 0.0)
