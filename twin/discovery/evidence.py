@@ -24,8 +24,8 @@ def build_evidence(
     rich: Sequence[tuple[str, tuple[float, ...]]] = (),
     mapper: MapFunction = map,
 ) -> LinearEvidence[Candidate]:
-    """Build the linear model about a parameter set; parameters at a bound are held there."""
-    free = [p for p in parameters.free if p.low < parameters.values[p.keys[0]] < p.high]
+    """Build the linear model about a parameter set."""
+    free = _list_released(log_residuals, parameters)
     variants: list[Variant[Candidate]] = []
     requests: list[tuple[ParameterSet, FreeParameter, float]] = [(parameters, p, 0.0) for p in free]
     for candidate in library:
@@ -50,6 +50,26 @@ def build_evidence(
         _measure_force(log_residuals), rich_columns,
         np.concatenate([residuals.expected_entries for residuals in log_residuals]),
     )  # fmt: skip
+
+
+def _list_released(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
+) -> list[FreeParameter]:
+    """Return the free parameters but those that the residual presses against a bound.
+
+    A parameter may be at a bound because an effect, which the set now lacks, stood for it.
+    """
+    before = [residuals.evaluate(parameters) for residuals in log_residuals]
+
+    def is_released(free: FreeParameter) -> bool:
+        value = parameters.values[free.keys[0]]
+        if free.low < value < free.high:
+            return True
+        slopes = compute_slopes(log_residuals, parameters, free, before)
+        slope = sum(float(own @ r) for own, r in zip(slopes, before, strict=True))
+        return slope < 0.0 if value <= free.low else slope > 0.0
+
+    return [free for free in parameters.free if is_released(free)]
 
 
 def _fill_columns(
