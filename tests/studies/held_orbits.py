@@ -3,6 +3,7 @@
     python -m tests.studies.held_orbits starts --count 40     start_hz over 2.75 to 4.1 Hz, two rigs
     python -m tests.studies.held_orbits bounds --count 20     profiles, on each of three rigs
     python -m tests.studies.held_orbits stops --count 60      stop and abort at random samples
+    python -m tests.studies.held_orbits releases --count 30   the same, within a release
 
 The command is read where it is written to the rig, so its acceleration is exact.
 """
@@ -10,9 +11,10 @@ The command is read where it is written to the rig, so its acceleration is exact
 import argparse
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from unittest.mock import patch
 
 import numpy as np
 
@@ -23,6 +25,8 @@ from table_io.clock import ManualClock
 from table_io.control.table_response import evaluate_transfer
 from table_io.errors import InputError
 from table_io.records import Event, FrequencyResponse, OrbitPoint, RunStop
+from table_io.sequencer.releases import advance_releases
+from table_io.sequencer.state import SequencerState
 from twin.setup.run_config import RunConfig, read_run_config
 
 RIGS = ("simulated", "hydraulic", "slow_clock")
@@ -219,9 +223,56 @@ def try_stops(folder: Path, count: int, seed: int) -> None:
     print(f"{bad} of {count} wrong")
 
 
+def try_stops_in_releases(folder: Path, count: int, seed: int) -> None:
+    """Stop and abort while the feedback of an orbit is released, pushed or caught again."""
+    rng, bad, within = np.random.default_rng(seed), 0, 0
+    config = read(folder, points=3)
+    for index in range(count):
+        name, released = ("stop", "abort")[index % 2], list[int]()
+        number, delay_s = int(rng.integers(1, 5)), float(rng.uniform(0.0, 1.5))
+
+        def note(
+            state: SequencerState, block: Block, released: list[int] = released
+        ) -> SequencerState:
+            before, after = state.search, advance_releases(state, block).search
+            assert before is not None
+            assert after is not None
+            assert before.releases is not None
+            assert after.releases is not None
+            if after.releases.is_released and not before.releases.is_released:
+                released.append(block.end)
+            return replace(state, search=after)
+
+        asked: list[int] = []
+
+        def operate(
+            end: int, number: int = number, delay_s: float = delay_s, name: str = name,
+            released: list[int] = released, asked: list[int] = asked,
+        ) -> OperatorCommand | None:  # fmt: skip
+            due = len(released) >= number
+            if asked or not due or end < released[number - 1] + delay_s * config.drive.rate_hz:
+                return None
+            asked.append(end)
+            return OperatorCommand(name, "study")
+
+        with patch("table_io.sequencer.orbits.advance_releases", note):
+            test = play(config, operate)
+        within += bool(asked)
+        since = asked[0] if asked else test.command_m.size
+        is_good = test.rests(5.0, since) and test.peak_m_s2 <= test.bound_m_s2 and test.is_whole
+        bad += not is_good
+        print(
+            f"{index:>3} {name} {delay_s:.2f} s into release {number} of "
+            f"{len(released)}: {'good' if is_good else 'WRONG'}, peak "
+            f"{test.peak_m_s2 / test.bound_m_s2:.3f} of the bound, {test.verdict}",
+            flush=True,
+        )
+    print(f"{bad} of {count} wrong, {within} asked within a release")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=("starts", "bounds", "stops"))
+    parser.add_argument("what", choices=("starts", "bounds", "stops", "releases"))
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--points", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
@@ -231,8 +282,10 @@ def main() -> None:
             try_starts(Path(name), options.count, options.points)
         elif options.what == "bounds":
             try_bounds(Path(name), options.count, options.seed)
-        else:
+        elif options.what == "stops":
             try_stops(Path(name), options.count, options.seed)
+        else:
+            try_stops_in_releases(Path(name), options.count, options.seed)
 
 
 if __name__ == "__main__":
