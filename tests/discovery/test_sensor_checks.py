@@ -14,9 +14,11 @@ from scipy import signal
 from table_io.block import Block, Float1D, Label, join_blocks
 from tests.builders.laboratories import draw_laboratory
 from tests.discovery.played import SNM, blocks
+from twin.discovery.build_verdict import build_sensors
 from twin.discovery.discover import PreparedLog, prepare_problem
 from twin.discovery.sensor_checks import SensorCheck, check_sensors
 from twin.discovery.signals import build_signals
+from twin.discovery.words import describe_sensors
 
 RATE_HZ, MASS_KG = 1000.0, 550.0
 MASS, TABLE = ("mass_disp_m", "mass_acc_m_s2"), ("table_disp_m", "table_acc_m_s2")
@@ -125,6 +127,22 @@ def discard_peaks(channel: str, share: float) -> Block:
     """Return the recording with lost samples where a channel exceeds a share of its largest."""
     limit = share * np.abs(record().channel(channel)).max()
     return distort(channel, lambda x, _: np.where(np.abs(x) < limit, x, np.nan))
+
+
+@pytest.mark.parametrize(("share", "count"), [(0.0, 0), (0.01, 1)])
+def test_what_healthy_sensors_of_a_rocking_mass_disagree_by_is_stated(
+    share: float, count: int
+) -> None:
+    def rock(values: Float1D, _: Block) -> Float1D:
+        f = np.fft.rfftfreq(values.size, 1.0 / RATE_HZ)
+        gain = 1.0 + share / (1.0 - (f / 7.0) ** 2 + 0.1j * f / 7.0)
+        return np.fft.irfft(np.fft.rfft(values) * gain, values.size)
+
+    sensors = build_sensors(check(distort("mass_acc_m_s2", rock)))
+    verdict, *lines = describe_sensors(sensors)
+    assert verdict == "sensors: healthy"
+    assert len(lines) == count
+    assert all("disagreement left of mass_disp_m against mass_acc_m_s2" in line for line in lines)
 
 
 def test_the_peaks_of_a_laser_that_are_cut_off_are_a_fault() -> None:

@@ -181,16 +181,21 @@ class CheckRow(NamedTuple):
 
 
 def describe_sensors(sensors: Sensors) -> list[str]:
-    """Return the verdict on the instruments in lines: one, and one for each error."""
-    faults = [check for check in sensors.checks if not check.healthy]
+    """Return the verdict on the instruments in lines: one, and one for each error.
+
+    What healthy sensors of a body disagree by beyond their noise, as of a mass that rocks, is
+    stated too: it moves parameters by more than their intervals, which count the noise.
+    """
     lines = [f"sensors: {sensors.state}"]
-    for check in faults:
+    for check in sensors.checks:
+        if check.healthy and not (check.kind == "remainder" and check.limit):
+            continue
         allowed = (
             f", allowed {'from' if check.kind in ('filter', 'resonance') else 'up to'} "
             f"{_format_size(check, check.limit)}"
             if check.limit
             else ""
-        )
+        ) + ("; the intervals do not count it" if check.healthy else "")
         lines.append(
             f"  {KIND_LABELS.get(check.kind, check.kind)} of "
             f"{' against '.join(check.channels)}: {_format_size(check, check.value)}{allowed}"
