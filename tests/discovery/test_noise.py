@@ -8,6 +8,7 @@ from table_io.block import Bool2D, Float1D
 from twin.discovery.noise import (
     compare_with_white,
     estimate_noise_density,
+    find_shown_roll_off,
     measure_rest_noise,
 )
 
@@ -93,3 +94,16 @@ def test_the_rest_shows_an_anti_alias_filter(corner: float) -> None:
     assert noise is not None
     assert noise.filter_hz == pytest.approx(1e3 * corner, rel=0.1)
     assert noise.corner_hz == 0.0
+
+
+@pytest.mark.parametrize("noise", [1e-5, 1e-4, 1e-2])
+def test_the_end_of_a_motion_is_no_anti_alias_filter(noise: float) -> None:
+    rng, rate_hz, size = np.random.default_rng(0), 200.0, 12_000
+    hz = np.fft.rfftfreq(size, 1.0 / rate_hz)
+    parts = rng.standard_normal((2, hz.size))
+    spectrum = np.where((hz > 0.3) & (hz < 18.0), parts[0] + 1j * parts[1], 0.0)
+    acc = np.fft.irfft(spectrum, size)
+    disp = np.fft.irfft(spectrum / np.maximum(hz, hz[1]) ** 2, size)
+    for motion in (acc, disp):
+        read = motion + noise * motion.std() * rng.standard_normal(size)
+        assert np.isinf(find_shown_roll_off(read, rate_hz))

@@ -158,9 +158,12 @@ def find_loudest_power(values: Float1D, rate_hz: float) -> NoiseBands:
 def find_shown_roll_off(values: Float1D, rate_hz: float) -> float:
     """Return where quiet segments in motion fall as behind an anti-alias filter, Hz; inf: nowhere.
 
-    There the motion may end, too; but not in every channel, as where a logger filters.
+    There the motion may end, too; but behind a filter the fall goes on up to the highest frequency,
+    where a motion that ends leaves noise.
     """
-    return _find_roll_off(_estimate_quiet_bands(values[np.isfinite(values)])) * rate_hz
+    quiet = _estimate_quiet_bands(values[np.isfinite(values)])
+    goes_on = quiet.power[-1 - BANDS_PER_OCTAVE :][0] > MIN_FILTER_FALL * quiet.power[-1]
+    return _find_roll_off(quiet) * rate_hz if goes_on else math.inf
 
 
 def _find_resolution(values: Float1D) -> float:
