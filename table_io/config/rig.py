@@ -6,6 +6,7 @@ A backend registers under its name in the entry-point group `shaketwin.backends`
 imported when a rig file names it, not before.
 """
 
+import math
 from collections.abc import Mapping
 from functools import cache, cached_property
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
@@ -167,6 +168,9 @@ class OutputConfig(ConfigModel):
         return replace_after + round(self.lead_s * rate_hz)
 
 
+LEAST_MAX_CORRECTION = 2.0  # also of a rig that accepts smaller deviations at both ends
+
+
 class TableResponse(ConfigModel):
     """What is known of the table, and what loop check and protection accept of it.
 
@@ -180,13 +184,13 @@ class TableResponse(ConfigModel):
     )
     gain: tuple[Positive, Positive] = Field(
         (0.8, 1.2),
-        description="Gain at the lowest frequency, from and to; the first for a table that follows "
-        "without lag, less for one of `lag_ms`.",
+        description="Gain at the lowest frequency, from and to; where `lag_ms` is stated, from the "
+        "first times that of a loop with this lag.",
     )
     top_gain: tuple[Positive, Positive] = Field(
         (0.5, 1.25),
-        description="Gain at the end of the sweep. The least of all gains accepted limits by how "
-        "much amplitude control raises a command.",
+        description="Gain at the end of the sweep. Amplitude control corrects all gains accepted, "
+        "and a factor of 2 in any case.",
     )
     gain_residual_percent: Positive = Field(
         10.0, description="Gain off a straight line of its logarithm over the square of frequency."
@@ -205,7 +209,7 @@ class TableResponse(ConfigModel):
         15.0,
         le=200,
         description="Lag of the table behind its command near the first resonance, which the gains "
-        "of a feedback allow for.",
+        "of a feedback and, where it is stated, the limits of `gain` allow for.",
     )
     delay_spread_ms: Positive = Field(
         5.0, description="Spread of the delay over the frequencies; at least half of its mean."
@@ -220,8 +224,18 @@ class TableResponse(ConfigModel):
 
     @property
     def max_correction(self) -> float:
-        """Largest factor on a command for the table's gain; beyond is a fault, not a roll-off."""
-        return 1.0 / min(self.gain[0], self.top_gain[0])
+        """Largest factor on a command for the table's gain, and of its inverse."""
+        lowest, highest = zip(self.gain, self.top_gain, strict=True)
+        return max(LEAST_MAX_CORRECTION, 1.0 / min(lowest), *highest)
+
+    def find_least_gain(self, frequency_hz: float) -> float:
+        """Return the least gain accepted at the lowest frequency of a test.
+
+        A slow loop with a lag T has a gain of 1 / sqrt(1 + (w T)^2), a mere delay one of 1.
+        """
+        lag_s = 1e-3 * self.lag_ms if "lag_ms" in self.model_fields_set else 0.0
+        roll_off = math.hypot(1.0, 2.0 * math.pi * frequency_hz * lag_s)
+        return max(self.gain[0] / roll_off, 1.0 / self.max_correction)
 
 
 class RigConfig(ConfigModel):

@@ -145,15 +145,15 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
     A servo rolls off, so the gain is near 1 at the lowest frequency only; above it the gain must
     follow a smooth curve, within the range that amplitude control can correct. A drive relies on
     the table for which it was computed: gain and delay are then compared with what is expected of
-    that table. The rig file states the ranges; of a test below its least level, at which friction
-    shapes the motion, it states none.
+    that table. The rig file states the ranges; below its least level friction holds the table back,
+    and no gain is too low.
     """
     allowed = data.rig.table_response
     frequencies_hz, expected = data.frequencies_hz, data.expected_tones
     is_stated = expected is not None or not is_below_friction(data.profile, data.rig)
 
-    def limit(low: float, high: float) -> tuple[float, float]:
-        return (low, high) if is_stated else NO_LIMITS
+    def limit(high: float) -> float:
+        return high if is_stated else math.inf
 
     for name in TABLE_CHANNELS:
         if not _has_clear_tone(data, name):
@@ -162,15 +162,13 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         ratios = tones if expected is None else tones / expected
         polarity = float(np.cos(np.angle(tones[0])))
         yield make_check(data, "polarity against the command", name, polarity, 0.0, 1.0, "")
-        # A slow loop with a lag T has a gain of 1 / sqrt(1 + (w T)^2), a mere delay one of 1.
-        roll_off = math.hypot(1.0, 2e-3 * math.pi * float(frequencies_hz[0]) * allowed.lag_ms)
-        least_gain = max(allowed.gain[0] / roll_off, 1.0 / allowed.max_correction)
-        gain_range = limit(least_gain, allowed.gain[1])
+        least_gain = allowed.find_least_gain(float(frequencies_hz[0])) if is_stated else 0.0
+        gain_range = least_gain, allowed.gain[1]
         yield make_check(data, "gain", name, abs(tones[0]), *gain_range, "")
         swept = np.flatnonzero(frequencies_hz <= data.profile.plan.high_hz * (1 + 1e-9))
         if swept.size > 1:
             top_gain = abs(tones[swept[-1]])
-            top_range = limit(*allowed.top_gain)
+            top_range = allowed.top_gain if is_stated else (0.0, allowed.top_gain[1])
             yield make_check(data, "gain at the highest frequency", name, top_gain, *top_range, "")
         if expected is not None or swept.size > 2:
             label, logarithms = "gain off that of the drive", np.log(np.abs(ratios))
@@ -178,7 +176,7 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
                 label, z = "gain off a smooth curve", frequencies_hz[swept] ** 2
                 logarithms = logarithms[swept] - np.polyval(np.polyfit(z, logarithms[swept], 1), z)
             off, allowed_off = 100.0 * np.abs(logarithms).max(), allowed.gain_residual_percent
-            yield make_check(data, label, name, off, *limit(0.0, allowed_off), "%")
+            yield make_check(data, label, name, off, 0.0, limit(allowed_off), "%")
         delays = _find_delays(tones * np.sign(polarity), frequencies_hz)
         longest = delays[np.argmax(np.abs(delays))]
         yield make_check(data, "delay", name, longest, *DELAY_RANGE_MS, "ms")
@@ -189,7 +187,7 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
             off_drive = " off that of the drive," if expected is not None else ""
             spread = float(np.ptp(_find_delays(ratios * np.sign(polarity), frequencies_hz)))
             label = f"delay{off_drive} over the frequencies"
-            yield make_check(data, label, name, spread, *limit(0.0, max_spread), "ms")
+            yield make_check(data, label, name, spread, 0.0, limit(max_spread), "ms")
 
 
 def _has_clear_tone(data: LoopCheckData, *names: str) -> bool:
@@ -346,15 +344,19 @@ def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
     tare = rig.tare
     tared = {} if tare is None else dict(zip(tare.channels, tare.noise_v, strict=True))
 
-    def noise(name: str) -> float:
+    def list_noise(name: str) -> list[tuple[float, str]]:
         sensor = rig.sensor(name)
         stated = math.hypot(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
-        return factor * max(stated, tared.get(name, 0.0) / abs(sensor.volts_per_si))
+        of_tare = tared.get(name, 0.0) / abs(sensor.volts_per_si)
+        return [(stated, "the rig file"), (of_tare, f"the tare of {tare.at if tare else ''}")]
+
+    def noise(name: str) -> float:
+        return factor * max(list_noise(name))[0]
 
     faults = [
         f"noise of {name} is {value:.3g} {unit} "
         + ("below the level " if unit == "dB" else "")
-        + "in a short rest by the rig file and its newest tare, allowed "
+        + f"in a short rest by {max(list_noise(name))[1]}, allowed "
         + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
         + f" {unit}"
         for name, value, low, high, unit in list_noise_margins(

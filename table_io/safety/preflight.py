@@ -238,7 +238,7 @@ def check_limits(
                 sentence,
                 where="loop check",
                 remedy="raise the level, use a quieter sensor or a smaller range, or correct "
-                "noise_rms in the rig file",
+                "noise_rms in the rig file; a tare out of date is replaced by `shaketwin tare`",
             )
             for sentence in list_known_faults(profile, rig)
         ),
@@ -495,8 +495,8 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
         messages.append(
             f"the level is {profile.plan.level_m_s2 / GRAVITY_M_S2:.3g} g at most, below "
             f"table_response.least_level_g = {rig.table_response.least_level_g:g}: friction shapes "
-            "what this table plays, and the loop check judges neither its gain nor its delay; "
-            "raise the level"
+            "what this table plays, and the loop check takes no gain as too low, nor delays as too "
+            "far apart; raise the level"
         )
     if {"acceleration_g", "level_points"} <= profile.excitation.model_fields_set:
         kind = profile.excitation.kind
@@ -541,7 +541,7 @@ def check_corrected_drive(
         faults.append(
             f"{row.name}: the table follows with a gain of {1.0 / correction:.3g}, so the command "
             f"would have to be {correction:.3g} times as large; "
-            f"allowed: at most {max_correction:g} by the gains that table_response accepts. "
+            f"allowed: at most {max_correction:g}, see table_response.top_gain of the rig. "
             "Lower sweep.stop_hz, or tune the servo"
         )
     return faults

@@ -42,7 +42,7 @@ MIN_REPEAT_SAMPLES = 5
 MIN_ERROR_SAMPLES = 8
 MAX_READ_BACK_RATIO = 0.01  # of the command
 MAX_READ_BACK_RANGE = 5e-4
-# Of the amplitude: includes the gain of +-20 % that the loop check allows.
+# Of the amplitude: includes a gain of +-20 %, which the loop check allows where no lag is stated.
 MAX_INITIAL_FOLLOWING_RATIO = 0.25
 # Before the sweep: more than a sensor of wrong sign or offset shows, which the loop check reports.
 MAX_CHECK_ERROR_RATIO, MAX_CHECK_ERROR_STROKE = 2.5, 0.02

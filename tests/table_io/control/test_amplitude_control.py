@@ -8,6 +8,7 @@ import pytest
 
 from table_io.block import Label
 from table_io.config.profile import ControlConfig
+from table_io.config.rig import TableResponse
 from table_io.control.amplitude_control import Tuning, is_within_tolerance, update_target
 from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
@@ -204,3 +205,14 @@ def test_remembered_target_takes_the_level_of_the_step() -> None:
     )
     again = tuning.add_accepted(SineTarget(3.0, A, 1.2))
     assert [target.correction for target in again.accepted] == [1.3, 1.2]
+
+
+@pytest.mark.parametrize("gain", [(0.8, 1.2), (0.95, 1.2), (1.01, 1.3)])
+@pytest.mark.parametrize("top_gain", [(0.2, 1.25), (0.95, 1.25), (1.01, 2.5)])
+def test_every_gain_that_a_rig_accepts_can_be_corrected(
+    gain: tuple[float, float], top_gain: tuple[float, float]
+) -> None:
+    response = TableResponse(gain=gain, top_gain=top_gain)
+    tuning = Tuning(max_correction=response.max_correction)
+    for accepted in (*gain, *top_gain, 0.5, 2.0):
+        assert tuning.clamp(1.0 / accepted) == pytest.approx(1.0 / accepted)

@@ -467,6 +467,18 @@ def test_gain_at_the_lowest_frequency_rolls_off_with_the_lag(lag_ms: float, pass
     assert failed == (set() if passes else {"gain"})
 
 
+def test_below_the_least_level_a_gain_that_is_too_large_is_no_friction() -> None:
+    """Friction holds a table back: twice the motion is a wrong span of output or sensors."""
+    profile, block, drive, noise = record_loop_check("gm10")
+    rig = change_rig(table_response={"least_level_g": 0.1})
+    doubled = block.values.copy()
+    for name in ("table_disp_m", "table_acc_m_s2"):
+        doubled[block.channels.index(name)] *= 2.0
+    checks = evaluate(replace(block, values=doubled), drive, profile, rig, noise)[0]
+    failed = {check.name for check in checks if not check.passed}
+    assert {"gain", "gain at the highest frequency"} <= failed
+
+
 @pytest.mark.parametrize(("least_level_g", "passes"), [(0.05, False), (0.0501, True)])
 def test_gain_of_a_table_below_its_least_level_is_reported_only(
     least_level_g: float, passes: bool
