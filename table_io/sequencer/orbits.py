@@ -382,6 +382,9 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         state = replace(state, search=search, records=(*state.records, point))
         return _next_orbit(state)
     factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
+    gain = abs(state.tuning.transfer(target.frequency_hz))
+    # no more than the command can change
+    factor = state.tuning.clamp(search.level_factor * factor / gain) * gain / search.level_factor
     # The motion is corrected for the level that the table will have, not for that which it had.
     table_change = table_harmonics(
         target.frequency_hz, (factor - 1.0) * abs(nominal), plan.harmonics
