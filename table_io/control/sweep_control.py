@@ -6,8 +6,8 @@ the delay of window and queue cannot make the loop oscillate. The same is done w
 each limited channel to the level, from which the level is reduced before the limit is reached.
 
 A ratio is extrapolated as its difference from what is known of it (the response of the loop check,
-an earlier pass, the twin of the specimen), or as itself where that is the straighter one, over
-ln f, by the median slope of the last points: one jump of the specimen does not tilt it.
+an earlier pass, the twin of the specimen) over ln f, by the median slope of the last points: one
+jump of the specimen does not tilt it.
 """
 
 import math
@@ -22,6 +22,9 @@ from table_io.records import SweepLevel
 
 SLOPE_POINTS = 5  # of the extrapolation
 MAX_SLOPE = 15.0  # of ln(ratio) over ln f: a resonance of 3 % damping
+JUMP_CHANGE = 0.4  # in ln(ratio): beyond is a jump of the specimen
+MIN_BEND = 0.01  # in ln(ratio), from which a curve does not fit the points: noise is less
+MIN_BEND_RATIO = 3.0  # of two bends, from which they differ by more than noise
 LIMIT_SHARE = 0.96  # of a limit, at which a notch aims: a jump of the specimen takes of the rest
 RISE_SHARE = 0.5  # of `clamp_db`, by which a notch may open in an update
 MAX_SWEEP_CORRECTION = 20.0  # of the command: 26 dB of roll-off
@@ -40,26 +43,28 @@ def combine_levels(config: SweptSine, amplitudes: Mapping[str, float], w: float)
 
 
 def extrapolate_ratio(points: Sequence[tuple[float, float]], known: Curve, ln_f: float) -> float:
-    """Return ln(ratio) at ln f from measured (ln f, ln(ratio)), oldest first, and what is known.
-
-    What is known counts as far as the last points differ from it more evenly than from a constant:
-    an earlier pass may have been on another branch of the specimen.
-    """
+    """Return ln(ratio) at ln f from measured (ln f, ln(ratio)), oldest first, and what is known."""
     if not points:
         return known(ln_f)
-    curves = [(known, _list_slopes(points, known)), (_flat, _list_slopes(points, _flat))]
-    curve, slopes = curves[0]
-    if len(slopes) >= SLOPE_POINTS - 1:
-        curve, slopes = min(curves, key=lambda entry: max(entry[1]) - min(entry[1]))
-        slope = min(max(float(np.median(slopes)), -MAX_SLOPE), MAX_SLOPE)
-    else:
-        slope = 0.0
+    slopes = _list_slopes(points, known)
+    slope = float(np.median(slopes)) if len(slopes) >= SLOPE_POINTS - 1 else 0.0
+    slope = min(max(slope, -MAX_SLOPE), MAX_SLOPE)
     at, value = points[-1]
-    return curve(ln_f) + value - curve(at) + slope * (ln_f - at)
+    return known(ln_f) + value - known(at) + slope * (ln_f - at)
 
 
-def _flat(_: float) -> float:
-    return 0.0
+def choose_curve(points: Sequence[tuple[float, float]], earlier: Curve) -> Curve:
+    """Return the curve of an earlier pass, or zero where the specimen was then on another branch.
+
+    It was if the last points less that curve bend beyond noise, and far more than the points do.
+    """
+    flat = make_curve(())
+    slopes = [_list_slopes(points, curve) for curve in (earlier, flat)]
+    if len(slopes[0]) < SLOPE_POINTS - 1:
+        return earlier
+    step = abs(points[-1][0] - points[-SLOPE_POINTS][0]) / (SLOPE_POINTS - 1)
+    bend, own = (step * (max(each) - min(each)) for each in slopes)
+    return flat if bend > max(MIN_BEND, MIN_BEND_RATIO * own) else earlier
 
 
 def _list_slopes(points: Sequence[tuple[float, float]], known: Curve) -> list[float]:
@@ -75,7 +80,7 @@ def _list_slopes(points: Sequence[tuple[float, float]], known: Curve) -> list[fl
 def make_curve(points: Sequence[tuple[float, float]]) -> Curve:
     """Return ln(ratio) over ln f through points, constant outside; 0 of none."""
     if not points:
-        return _flat
+        return lambda _: 0.0
     table = np.array(sorted(points))
     return lambda ln_f: float(np.interp(ln_f, table[:, 0], table[:, 1]))
 

@@ -20,12 +20,14 @@ from table_io.config.excitation.swept_sine import MAX_DWELLS, SweptSine
 from table_io.config.profile import NOTCH, LimitConfig
 from table_io.config.rig import RigConfig
 from table_io.control.sweep_control import (
+    JUMP_CHANGE,
     LIMIT_SHARE,
     MAX_SWEEP_CORRECTION,
     MIN_RATIO,
     RISE_SHARE,
     SLOPE_POINTS,
     Curve,
+    choose_curve,
     combine_levels,
     extrapolate_ratio,
     find_pass_resonances,
@@ -52,7 +54,6 @@ from table_io.sequencer.state import MAX_HOLD_S, SequencerState, Stage, SweepSea
 PREVIEW_LEADS = 3.0  # lead times of the queue that are planned ahead of a decision
 COMMAND_SHARE = 0.98  # of the limits of the rig that a corrected command may use
 MAX_RESONANCE_LAG = 0.2  # in ln f between the peaks of one resonance, up and down
-MAX_FORESEEN_CHANGE = 0.4  # in ln(ratio) from the last points on: beyond is a jump
 # Of a limit, up to which the level that the twin predicted is played. The twin aims at LIMIT_SHARE;
 # beside a jump the response hardly changes with the level, and to aim there too by what is measured
 # would take five per cent of the level for one of the response.
@@ -79,7 +80,7 @@ def check_swept_channels(config: SweptSine, rig: RigConfig) -> None:
 def begin_swept_sine(state: SequencerState) -> SequencerState:
     """Start softly at the first frequency."""
     config = _config(state)
-    gain = _known_gain(state, ())(math.log(config.ends_hz(0)[0]))
+    gain = _known_gain(state, [], ())(math.log(config.ends_hz(0)[0]))
     trajectory, position = start_swept(state.trajectory, config, math.exp(-gain))
     sweep = SweepSearch(position, trajectory.end)
     return _append_parts(replace(state, trajectory=trajectory, sweep=sweep))
@@ -334,11 +335,13 @@ def _select_levels(state: SequencerState, sweep: int) -> _PassLevels:
     return _PassLevels(sweep, list(passes.get(sweep, ())[-SLOPE_POINTS:]), earlier)
 
 
-def _known_gain(state: SequencerState, earlier: Sequence[SweepLevel]) -> Curve:
+def _known_gain(
+    state: SequencerState, points: list[tuple[float, float]], earlier: Sequence[SweepLevel]
+) -> Curve:
     """Return what is known of the table's gain: by an earlier pass, else by the loop check."""
     response = state.tuning.response
     if earlier:
-        return make_curve(list_gain_points(earlier))
+        return choose_curve(points, make_curve(list_gain_points(earlier)))
     if response is None:
         return make_curve(())
     ends = np.log([min(response.frequencies_hz), max(response.frequencies_hz)])
@@ -356,10 +359,10 @@ def _limit_level(
     reference = config.level_m_s2(frequency_hz)
     for entry in _list_notches(state):
         points = list_ratio_points(levels.own, entry.channel)
-        known = make_curve(list_ratio_points(levels.earlier, entry.channel))
+        earlier = make_curve(list_ratio_points(levels.earlier, entry.channel))
         if points or levels.earlier:
             ln_f = math.log(frequency_hz)
-            ratio = extrapolate_ratio(points, known, ln_f)
+            ratio = extrapolate_ratio(points, choose_curve(points, earlier), ln_f)
             foreseen = foresee_ratio(config, levels.sweep, entry.channel, points, ln_f)
             aim = LIMIT_SHARE
             if math.isfinite(foreseen):
@@ -391,9 +394,7 @@ def foresee_ratio(
         return math.nan
 
     predict = partial(config.predicted.log_ratio, sweep, channel)
-    near = [
-        point for point in points if abs(predict(ln_f) - predict(point[0])) < MAX_FORESEEN_CHANGE
-    ]
+    near = [point for point in points if abs(predict(ln_f) - predict(point[0])) < JUMP_CHANGE]
     if points[-1] not in near:
         return math.nan
     return extrapolate_ratio(near, predict, ln_f)
@@ -408,7 +409,8 @@ def _choose_correction(
 ) -> float:
     """Return the correction that gives a level, within the clamp and the limits of the rig."""
     config = _config(state)
-    known, points = _known_gain(state, levels.earlier), list_gain_points(levels.own)
+    points = list_gain_points(levels.own)
+    known = _known_gain(state, points, levels.earlier)
     correction = math.exp(-extrapolate_ratio(points, known, math.log(frequency_hz)))
     if before is not None and before.level_m_s2:
         factor = (correction / before.correction) ** config.compression

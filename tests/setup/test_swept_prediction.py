@@ -113,6 +113,20 @@ def test_level_before_a_jump_leaves_room_for_what_the_jump_does_to_the_table() -
     assert reduced.level_m_s2(0, 2.1) == pytest.approx(1.0)
 
 
+def test_a_steep_resonance_or_another_pass_is_no_jump() -> None:
+    """Two passes upwards, at 10 octaves a minute, to a flank of slope 10 over ln f."""
+    limit, ln_f = LIMIT_G * GRAVITY_M_S2, np.arange(0.0, 1.6, 0.1)
+    response = 0.97 * limit * np.exp(10.0 * np.minimum(ln_f - 1.2, 0.0))
+    rows = np.array(
+        [(sweep, *row) for sweep in (0.0, 1.0)
+         for row in zip(np.exp(ln_f), np.ones(ln_f.size), response, strict=True)]
+    )  # fmt: skip
+    profile = parse_toml(PROFILE, Profile, "notched.toml")
+    assert reduce_before_excess(PredictedSweep(("mass_acc_m_s2",), rows), profile) is None
+    rows[:16, 3], rows[16:, 3] = 0.5 * limit, 0.97 * limit
+    assert reduce_before_excess(PredictedSweep(("mass_acc_m_s2",), rows), profile) is None
+
+
 def test_prediction_travels_with_the_profile_and_is_not_computed_again(config: RunConfig) -> None:
     assert "prediction.csv" in config.profile_toml
     path = Path(PROFILES_DIR) / "tests" / "g10.toml"
@@ -132,3 +146,22 @@ def test_points_before_a_jump_say_nothing_about_the_branch_behind_it() -> None:
     assert foresee([*before, behind], math.log(2.06)) == pytest.approx(math.log(4.4))
     assert math.isnan(foresee(before, math.log(2.06)))
     assert foresee(before, math.log(1.97)) == pytest.approx(0.0)
+
+
+def test_a_flank_of_the_twin_is_foreseen_whatever_the_noise() -> None:
+    """Specimen as its twin: slope 1.5 over ln f, 7 from 0.05 on; noise of 0.1 %."""
+    ln_f = np.linspace(-0.1, 0.2, 301)
+    ratio = np.where(ln_f < 0.05, 1.5 * ln_f, 0.075 + 7.0 * (ln_f - 0.05))
+    rows = np.array([(0.0, math.exp(at), 1.0, math.exp(y))
+                     for at, y in zip(ln_f.tolist(), ratio.tolist(), strict=True)])  # fmt: skip
+    predicted = PredictedSweep(("mass_acc_m_s2",), rows)
+    config = SweptSine(
+        start_hz=0.5, stop_hz=2.0, prediction="p.csv", files={"p.csv": predicted.to_csv()}
+    )
+    rng = np.random.default_rng(1)
+    for _ in range(200):
+        noise = 0.001 * rng.standard_normal(5)
+        at = np.linspace(0.0, 0.048, 5)
+        points = list(zip(at.tolist(), (1.5 * at + noise).tolist(), strict=True))
+        foreseen = foresee_ratio(config, 0, "mass_acc_m_s2", points, 0.088)
+        assert foreseen == pytest.approx(0.075 + 7.0 * 0.038, abs=0.02)

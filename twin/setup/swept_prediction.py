@@ -22,7 +22,7 @@ from table_io.config.excitation.swept_sine import (
 )
 from table_io.config.profile import NOTCH, LoopCheckConfig, Profile
 from table_io.config.rig import RigConfig
-from table_io.control.sweep_control import LIMIT_SHARE, MIN_RATIO
+from table_io.control.sweep_control import JUMP_CHANGE, LIMIT_SHARE, MAX_SLOPE, MIN_RATIO
 from table_io.records import RunStart, RunStop, SweepLevel
 from table_io.sequencer.procedure import advance_test, make_test_plan, start_test
 from twin.compare import PREDICTED_CHANNELS, pipeline
@@ -30,11 +30,10 @@ from twin.compare.extra_channels import predict_channel
 from twin.transport.codec import Item
 
 BLOCK_S = 0.05  # simulated at once: shorter than the horizon of a decision
-POINTS_PER_OCTAVE = 96  # of a prediction: every level, up to 2 octaves a minute at 3 Hz
+POINTS_PER_OCTAVE = 96  # of a prediction: slower than 2 octaves a minute at 3 Hz it is thinned
 MAX_PREDICTIONS = 4
 MAX_LIMIT_RATIO = 1.015  # of a limit, from which a prediction is repeated
 JUMP_SPAN = 0.06  # in ln f before an excess, within which the level is reduced for it
-MAX_STEADY_CHANGE = 0.4  # in ln(response over level) from one level to the next: beyond is a jump
 JUMP_POINTS = 4  # levels from a jump on, in which its largest response is measured
 PREDICTION_FILE = "prediction.csv"
 TWIN_PREFIX = "free/"
@@ -124,7 +123,7 @@ def predict_notch(config: TwinTest, swept: SweptSine) -> PredictedSweep:
         items = generate_swept_twin(config, profile=profile)
         measured = [item for item in items if isinstance(item, SweepLevel)]
         levels = PredictedSweep.from_levels(swept, measured, POINTS_PER_OCTAVE)
-        # All of them: the largest response to a jump lasts for a cycle or two.
+        # Not thinned: the largest response to a jump lasts for a cycle or two.
         reduced = reduce_before_excess(PredictedSweep.from_levels(swept, measured), profile)
         if attempt == MAX_PREDICTIONS - 1 or reduced is None:
             break
@@ -139,17 +138,19 @@ def reduce_before_excess(levels: PredictedSweep, profile: Profile) -> PredictedS
     """Return a prediction with lower levels where a channel goes beyond its limit; None if none do.
 
     There, and within JUMP_SPAN before it, the level is at most what would have left LIMIT_SHARE of
-    the limit: a jump of the specimen is met with the level that it needs afterwards. At a jump the
-    level of a table that is shaken by it is off by as much as raises no alarm yet, and counts so.
+    the limit: a jump of the specimen is met with the level that it needs afterwards. A jump also
+    shakes the table: there the limit is to hold even at a level higher by `protection.alarm`.
     """
     table, ln_f = levels.table.copy(), np.log(levels.table[:, 1])
+    # What a resonance may change from a level to the next; far apart are the ends of two passes.
+    steady = np.maximum(JUMP_CHANGE, MAX_SLOPE * np.abs(np.diff(ln_f, prepend=math.nan)))
     excess = np.zeros(len(table))
     for entry in profile.limits:
         if entry.action == NOTCH and entry.channel in levels.channels:
             response = table[:, len(PREDICTION_COLUMNS) + levels.channels.index(entry.channel)]
             ratio = np.maximum(response / table[:, 2], MIN_RATIO)
             change = np.abs(np.diff(np.log(ratio), prepend=math.nan))
-            jumps = np.convolve(change > MAX_STEADY_CHANGE, np.ones(JUMP_POINTS))[: len(table)]
+            jumps = np.convolve(change > steady, np.ones(JUMP_POINTS))[: len(table)]
             margin = np.where(jumps > 0, 1.0 + profile.protection.alarm, 1.0)
             excess = np.maximum(excess, margin * response / entry.limit_si)
     beyond = np.flatnonzero(excess > MAX_LIMIT_RATIO).tolist()

@@ -250,7 +250,10 @@ class PredictedSweep:
     def from_levels(
         cls, config: SweptSine, levels: Sequence[SweepLevel], per_octave: float = math.inf
     ) -> "PredictedSweep":
-        """Return the prediction of simulated levels, thinned to so many points an octave."""
+        """Return the prediction of simulated levels, thinned to so many points an octave.
+
+        A frequency that stands still, in a dwell, has the first level only.
+        """
         rows: list[tuple[float, ...]] = []
         for level in levels:
             sweep = config.find_pass(level.step)
