@@ -39,7 +39,7 @@ SEND_BUFFER_BYTES = 2**16  # in the kernel, of one client
 MAX_BODY_BYTES = 1024
 DROP_TIMEOUT_S = 0.5  # for the place of a silent connection
 WRONG_CODE_S = 1.0  # between answers to wrong codes from one address
-MAX_WRONG_CODES = 16  # that wait for their answers; more codes of this address are not read
+MAX_WRONG_CODES = 16  # that wait for their answers, of all addresses; leaves connections free
 POLL_S = 0.1  # within which the server ends
 HEARTBEAT_S = 2.0  # between messages to a client when nothing changes
 HEADERS = {
@@ -127,9 +127,7 @@ class PageServer(ThreadingHTTPServer):
         self.streams = threading.BoundedSemaphore(MAX_STREAMS)
         # By address: one wrong code at a time, whatever the number of connections.
         self.code_locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
-        self.codes: defaultdict[str, threading.Semaphore] = defaultdict(
-            lambda: threading.Semaphore(MAX_WRONG_CODES)
-        )
+        self.wrong_codes = threading.BoundedSemaphore(MAX_WRONG_CODES)
         self._connections = threading.BoundedSemaphore(MAX_CONNECTIONS)
         self._silent: dict[Any, socket.socket] = {}  # without a request so far, oldest first
         super().__init__((host.strip("[]"), port), PageRequest)
@@ -273,19 +271,19 @@ class PageRequest(BaseHTTPRequestHandler):
 
     def _identify(self) -> str:
         """Return the name of the user, or "" after a refusal; a wrong code is logged and slowed."""
-        host = str(self.client_address[0])
-        if not self.server.codes[host].acquire(blocking=False):
-            self._reply_message(429, "too many wrong access codes wait for their answers")
-            return ""
-        try:
-            user = self.server.access.identify(self._code)
-            if not user and self._code:
+        user = self.server.access.identify(self._code)
+        if not user and self._code:
+            if not self.server.wrong_codes.acquire(blocking=False):
+                self._reply_message(429, "too many wrong access codes wait for their answers")
+                return ""
+            try:
+                host = str(self.client_address[0])
                 log.warning("wrong access code from %s", host)
                 with self.server.code_locks[host]:
                     clock = RealClock()
                     clock.wait_until(clock.now() + WRONG_CODE_S)
-        finally:
-            self.server.codes[host].release()
+            finally:
+                self.server.wrong_codes.release()
         if not user:
             self._reply_message(401, "log in with your access code")
         return user
