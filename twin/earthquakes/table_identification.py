@@ -8,6 +8,7 @@ accelerometer says little, the acceleration above, both as acceleration.
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from itertools import product
 from types import MappingProxyType
 
@@ -342,13 +343,16 @@ def fit_table(
     """
     names = tuple(bounds)
     typical, low, high = (np.array(column) for column in zip(*bounds.values(), strict=True))
-    evaluated: dict[bytes, Float1D] = {}  # by the values: a Jacobian begins at one of them
 
     def simulate(values: Float1D) -> Float1D:
         return problem.compute_residuals(build_parameters(names, values, problem))
 
+    @lru_cache(maxsize=2)  # a Jacobian begins at the values of the last step
+    def simulate_once(values: bytes) -> Float1D:
+        return simulate(np.frombuffer(values))
+
     def residuals(values: Float1D) -> Float1D:
-        return evaluated.setdefault(values.tobytes(), simulate(values))
+        return simulate_once(values.tobytes())
 
     def slopes(values: Float1D) -> Float2D:
         """Return the Jacobian by differences whose steps do not vanish with a parameter."""
@@ -356,7 +360,7 @@ def fit_table(
         for index, size in enumerate(np.maximum(np.abs(values), typical)):
             step = DIFFERENCE_STEP * size
             trials[index, index] += -step if values[index] + step > high[index] else step
-        before = evaluated[values.tobytes()]
+        before = residuals(values)
         jacobian = np.empty((problem.block.size, values.size))
         for index, changed in enumerate(map_in_threads(simulate, list(trials))):
             jacobian[:, index] = (changed - before) / (trials[index, index] - values[index])
