@@ -70,7 +70,8 @@ class HydraulicTableConfig(ConfigModel):
     )
     friction_drift_1_s: Finite = Field(
         0.0,
-        description="Relative rise of the friction with time; warm oil: it falls.",
+        description="Relative change of the friction per second from the start of the simulated "
+        "table, linear: it grows without limit, or falls to a twentieth; warm oil: it falls.",
     )
     coupling_play_mm: NonNegative = Field(
         0.0, description="Play between piston and table, from stop to stop."

@@ -22,7 +22,7 @@ What a worn or badly adjusted table has in addition; each is absent where its ke
     Q -> Q (1 + a tanh(x / x_a))                                           flow gains differ
     g -> g (1 + b) for q' > 0, g (1 - b) for q' < 0                        friction by direction
     g -> g max(1 + tanh(s q), 0.05)                                        friction along the stroke
-    F -> F max(1 + r t, 0.05)                           friction that drifts as the oil warms up
+    F -> F max(1 + r t, 0.05), t from the start of the run    friction that drifts, by warm oil
     m_p y_p'' = A p - N, N = k_p d + c_p d' with d = y_p - y beyond +-j/2  play j of the coupling
     q -> (1 + n) q, then twice 1 / (1 + s t_n / 2), in e                   transducer of the stroke
     m_a y_a'' = k_a (y_f - y_a) + c_a (y_f' - y_a')                      mass attached to the frame
