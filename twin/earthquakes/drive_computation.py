@@ -2,8 +2,9 @@
 
 A target motion is played on the table's twin, and what the twin lacks is added to the command
 through the inverse of its linear frequency response, until nothing more is gained: the inverse of
-the nonlinear twin within the band. What a real run lacks is added in the same way, which is the
-usual iteration of a laboratory (for instance De Cuyper, Swevers, Mech. Syst. Signal Process. 2003);
+the nonlinear twin within the band. Above it the target fades out, and only what the twin adds there
+is taken out. What a real run lacks in the band is added in the same way, which is the usual
+iteration of a laboratory (for instance De Cuyper, Swevers, Mech. Syst. Signal Process. 2003);
 friction, valve and impacts are then those of the last run.
 """
 
@@ -19,13 +20,14 @@ from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
+from table_io.errors import InputError
 from table_io.safety.loop_check import unwrap_phase
 from table_io.safety.loop_check_data import LoopCheckData
 from table_io.sequencer.procedure import start_test
 from table_io.sequencer.state import TestPlan
 from twin.earthquakes.table_response import CROSSOVER_HZ, PredictiveModel
 
-BAND_EDGE_RATIO = 1.25  # the inverse falls to nothing between the band's end and this multiple
+BAND_EDGE_RATIO = 1.25  # target and inverse fall to nothing between a band's end and this multiple
 MAX_AMPLIFICATION = 5.0  # of the inverse
 MAX_ROUNDS = 25
 LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
@@ -36,7 +38,7 @@ PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its
 
 @dataclass(frozen=True, eq=False)
 class TwinDrive:
-    """Command in m, (sample,), and the twin's expected acceleration error in the band, relative."""
+    """Command in m, (sample,), and the twin's acceleration error in the band alone, relative."""
 
     command_m: Float1D
     expected_error: float
@@ -52,25 +54,31 @@ def compute_command(
 ) -> TwinDrive:
     """Compute the command for a target displacement in m, (sample,), at rest at both ends.
 
-    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion. Up
-    to `highest_hz` what the twin adds above the band is taken out too: its oil column rings.
+    `reaction_n`, (sample,), is the force of the specimen on the table during the target motion.
+    The target fades out above the band; what the twin adds there, as its oil column rings, is taken
+    out up to `highest_hz`, in ever smaller part up to BAND_EDGE_RATIO times that.
     """
+    hz = np.asarray(np.fft.rfftfreq(target_m.size, 1.0 / rate_hz), float)
+    wanted = np.fft.irfft(np.fft.rfft(target_m) * _taper(hz, band_hz[1]), target_m.size)
     wide_hz = band_hz[0], max(band_hz[1], highest_hz)
-    best, best_error, lacking, step = np.zeros(target_m.size), math.inf, target_m, 1.0
+    best, best_error, lacking, step = np.zeros(target_m.size), math.inf, wanted, 1.0
     for _ in range(MAX_ROUNDS):
         command = best + step * compute_correction(lacking, model, rate_hz, wide_hz)
         achieved = model.simulate(command, rate_hz, reaction_n)[0]
-        error = measure_error(achieved, target_m, rate_hz, wide_hz)
-        if error >= best_error:
+        is_finite = np.isfinite(achieved).all()
+        error = measure_error(achieved, wanted, rate_hz, band_hz) if is_finite else math.inf
+        if error < best_error:
+            gain, best, best_error = best_error - error, command, error
+            lacking = wanted - achieved
+            if gain < LEAST_GAIN * (gain + error):
+                break
+        else:
             step *= 0.5
             if step < 0.2:
                 break
-        else:
-            gain, best, best_error = best_error - error, command, error
-            lacking = target_m - achieved
-            if gain < LEAST_GAIN * (gain + error):
-                break
-    return TwinDrive(best, measure_error(target_m - lacking, target_m, rate_hz, band_hz))
+    if math.isinf(best_error):
+        raise InputError("the twin of the table diverges on this target")
+    return TwinDrive(best, best_error)
 
 
 def compute_correction(
@@ -173,10 +181,15 @@ def _invert_response(
     """Return the inverse of the linear response, tapered above the band and bounded."""
     response = model.frequency_response(frequency_hz)
     size = np.maximum(np.abs(response), 1.0 / MAX_AMPLIFICATION)
-    beyond = (frequency_hz / highest_hz - 1.0) / (BAND_EDGE_RATIO - 1.0)
-    taper = np.cos(0.5 * math.pi * np.clip(beyond, 0.0, 1.0)) ** 2
-    inverse: npt.NDArray[np.complex128] = np.conj(response) / size**2 * taper
-    return inverse
+    inverse: npt.NDArray[np.complex128] = np.conj(response) / size**2
+    return inverse * _taper(frequency_hz, highest_hz)
+
+
+def _taper(frequency_hz: Float1D, end_hz: float) -> Float1D:
+    """Return a window of frequencies that is 1 up to a band's end and falls to 0 above it."""
+    beyond = (frequency_hz / end_hz - 1.0) / (BAND_EDGE_RATIO - 1.0)
+    taper: Float1D = np.cos(0.5 * math.pi * np.clip(beyond, 0.0, 1.0)) ** 2
+    return taper
 
 
 def _rest_at_ends(count: int, rate_hz: float) -> Float1D:

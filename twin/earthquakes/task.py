@@ -18,6 +18,7 @@ from table_io.config.rig import RigConfig
 from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from twin.earthquakes.drive_computation import (
+    BAND_EDGE_RATIO,
     CHANNELS,
     PlayedDrive,
     compute_command,
@@ -226,7 +227,8 @@ class DriveComputation:
         if after is None:
             report("computing the drive on the twin of the table")
             judged = self.twin.judgement.runs if self.twin.judgement else ()
-            highest_hz = min([BAND_WIDENING * self.band_hz[1], *(run.band_hz[1] for run in judged)])
+            ends_hz = (run.band_hz[1] / BAND_EDGE_RATIO for run in judged)
+            highest_hz = min([BAND_WIDENING * self.band_hz[1], *ends_hz])
             computed = compute_command(
                 self.model, self.target_m, rate_hz, self.band_hz, self.reaction_n, highest_hz
             )
