@@ -219,7 +219,7 @@ def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
     extents = sorted(
         (own.min(), own.max()) for own in (s.unstable_hz for s in _split_unstable(branch))
     )
-    others = " or ".join(f"{low:.4g} to {high:.4g}" for low, high in extents)
+    others = " or ".join(_format_inside(low, high) for low, high in extents)
     largest = f" (largest multiplier {max(inside):.4g})" if inside else ""
     return InputError(
         f"the model has no unstable orbit between folds from {range_hz[0]:g} to {range_hz[1]:g} "
@@ -229,6 +229,12 @@ def _make_refusal(branch: Branch, range_hz: tuple[float, float]) -> InputError:
         allowed=f"a range within {others} Hz" if others else "",
         remedy="choose another range, level or model",
     )
+
+
+def _format_inside(low: float, high: float) -> str:
+    """Return a range of positive numbers, its ends rounded inwards to four digits."""
+    scale = 10.0 ** (3 - math.floor(math.log10(high)))
+    return f"{math.ceil(low * scale) / scale:g} to {math.floor(high * scale) / scale:g}"
 
 
 def _split_unstable(branch: Branch) -> list[UnstableStretch]:
