@@ -185,7 +185,7 @@ def _press_stops(offset, speed, oil):  # type: ignore[no-untyped-def]
 
 
 @inline_jit
-def _find_sliding_friction(s, stroke, speed, oil):  # type: ignore[no-untyped-def]
+def _find_sliding_friction(stroke, speed, oil):  # type: ignore[no-untyped-def]
     """Return the friction in steady motion in N, without the viscous one."""
     g = oil.fc + (oil.fs - oil.fc) * math.exp(-((speed / oil.vs) ** 2))
     if oil.friction_asymmetry != 0.0:
@@ -203,7 +203,7 @@ def write_hydraulic_rates(s, y, vy, command, command_rate, oil, rate):  # type: 
     """
     stroke, speed = y - s[YF], vy - s[VYF]
     # Friction. Its force on the table opposes the speed of the piston in the cylinder.
-    g = _find_sliding_friction(s, stroke, speed, oil)
+    g = _find_sliding_friction(stroke, speed, oil)
     rate[BRISTLE] = 0.0
     friction = oil.viscous * speed
     if g > 0.0:
