@@ -25,7 +25,7 @@ def build_evidence(
     mapper: MapFunction = map,
 ) -> LinearEvidence[Candidate]:
     """Build the linear model about a parameter set."""
-    free = _list_released(log_residuals, parameters)
+    free = parameters.free
     variants: list[Variant[Candidate]] = []
     requests: list[tuple[ParameterSet, FreeParameter, float]] = [(parameters, p, 0.0) for p in free]
     for candidate in library:
@@ -41,35 +41,34 @@ def build_evidence(
     copies = [residuals.noise_copy for residuals in log_residuals]
     noisy, _ = _fill_columns(copies, parameters, requests, len(variants), mapper)
     noisy -= columns
+    held = _list_held(free, parameters, columns[: len(free)] @ columns[-1])
+    if held:  # a copy of many samples
+        columns, noisy = (np.delete(rows, held, axis=0) for rows in (columns, noisy))
     unit = _number_units(log_residuals)
     rich_columns = [
         k for k, variant in enumerate(variants) if (variant.candidate.name, variant.shape) in rich
     ]
     return absorb_base(
-        columns, noisy @ noisy.T, len(free), unit, tuple(variants), places,
+        columns, noisy @ noisy.T, len(free) - len(held), unit, tuple(variants), places,
         _measure_force(log_residuals), rich_columns,
         np.concatenate([residuals.expected_entries for residuals in log_residuals]),
     )  # fmt: skip
 
 
-def _list_released(
-    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
-) -> list[FreeParameter]:
-    """Return the free parameters but those that the residual presses against a bound.
+def _list_held(
+    free: Sequence[FreeParameter], parameters: ParameterSet, slopes: Float1D
+) -> list[int]:
+    """Return the places of the parameters that the residual presses against a bound.
 
-    A parameter may be at a bound because an effect, which the set now lacks, stood for it.
+    `slopes`, (free,), are those of half the residual squares. A parameter may be at a bound because
+    an effect, which the set now lacks, stood in for it: that one is free.
     """
-    before = [residuals.evaluate(parameters) for residuals in log_residuals]
-
-    def is_released(free: FreeParameter) -> bool:
-        value = parameters.values[free.keys[0]]
-        if free.low < value < free.high:
-            return True
-        slopes = compute_slopes(log_residuals, parameters, free, before)
-        slope = sum(float(own @ r) for own, r in zip(slopes, before, strict=True))
-        return slope < 0.0 if value <= free.low else slope > 0.0
-
-    return [free for free in parameters.free if is_released(free)]
+    values = [parameters.values[own.keys[0]] for own in free]
+    return [
+        place
+        for place, (own, value, slope) in enumerate(zip(free, values, slopes, strict=True))
+        if (value <= own.low and slope >= 0.0) or (value >= own.high and slope <= 0.0)
+    ]
 
 
 def _fill_columns(
