@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.signal import spectrogram, welch
 
-from table_io.block import Bool2D, Float1D, Int1D
+from table_io.block import Bool1D, Bool2D, Float1D, Int1D
 from twin.compare.hum import separate_hum
 
 MIN_REST_SAMPLES = 100
@@ -162,7 +162,7 @@ def find_shown_roll_off(values: Float1D, rate_hz: float) -> float:
     where a motion that ends leaves noise.
     """
     quiet = _estimate_quiet_bands(values[np.isfinite(values)])
-    goes_on = quiet.power[-1 - BANDS_PER_OCTAVE :][0] > MIN_FILTER_FALL * quiet.power[-1]
+    goes_on = _mark_falls(quiet)[-1:].all()
     return _find_roll_off(quiet) * rate_hz if goes_on else math.inf
 
 
@@ -214,10 +214,16 @@ def _average_bands(
 
 def _find_roll_off(noise: NoiseBands) -> float:
     """Return the frequency above which an anti-alias filter lowers the noise; inf without one."""
-    power, octave = noise.power, BANDS_PER_OCTAVE
-    falls = power[:-octave] > MIN_FILTER_FALL * power[octave:]
-    rolling_off = np.flatnonzero(falls & (noise.frequency[:-octave] > MIN_FILTER_CYCLES))
-    return float(noise.frequency[rolling_off[0]]) if rolling_off.size else math.inf
+    frequency, falls = noise.frequency[:-BANDS_PER_OCTAVE], _mark_falls(noise)
+    rolling_off = np.flatnonzero(falls & (frequency > MIN_FILTER_CYCLES))
+    return float(frequency[rolling_off[0]]) if rolling_off.size else math.inf
+
+
+def _mark_falls(noise: NoiseBands) -> Bool1D:
+    """Return from which bands, but those of the last octave, power falls as behind a filter."""
+    octave = BANDS_PER_OCTAVE
+    falls: Bool1D = noise.power[:-octave] > MIN_FILTER_FALL * noise.power[octave:]
+    return falls
 
 
 def _fit_white_and_slow(at_rest: NoiseBands, passed: int) -> tuple[float, float]:
