@@ -330,6 +330,16 @@ def find_amplitude(profile: Profile, frequency_hz: float) -> float:
     return plan.level_m_s2 / (2 * math.pi * frequency_hz) ** 2
 
 
+def _find_known_noise(rig: RigConfig, name: str) -> tuple[float, str]:
+    """Return (rms noise of a channel at rest, SI; where it is stated), the larger of two."""
+    sensor, tare = rig.sensor(name), rig.tare
+    known = [(math.hypot(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0)), "the rig file")]
+    if tare is not None and name in tare.channels:
+        noise_v = tare.noise_v[tare.channels.index(name)]
+        known.append((noise_v / abs(sensor.volts_per_si), f"the tare of {tare.at}"))
+    return max(known)
+
+
 def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
     """List what the loop check will refuse by what is known before: noise and converter steps.
 
@@ -341,22 +351,13 @@ def list_known_faults(profile: Profile, rig: RigConfig) -> list[str]:
     rest_samples = profile.acquisition.rest_s * profile.acquisition.rate_hz
     factor = 1.0 + KNOWN_SIGMAS / math.sqrt(2.0 * rest_samples)
 
-    tare = rig.tare
-    tared = {} if tare is None else dict(zip(tare.channels, tare.noise_v, strict=True))
-
-    def list_noise(name: str) -> list[tuple[float, str]]:
-        sensor = rig.sensor(name)
-        stated = math.hypot(sensor.noise_si, sensor.lsb_si / math.sqrt(12.0))
-        of_tare = tared.get(name, 0.0) / abs(sensor.volts_per_si)
-        return [(stated, "the rig file"), (of_tare, f"the tare of {tare.at if tare else ''}")]
-
     def noise(name: str) -> float:
-        return factor * max(list_noise(name))[0]
+        return factor * _find_known_noise(rig, name)[0]
 
     faults = [
         f"noise of {name} is {value:.3g} {unit} "
         + ("below the level " if unit == "dB" else "")
-        + f"in a short rest by {max(list_noise(name))[1]}, allowed "
+        + f"in a short rest by {_find_known_noise(rig, name)[1]}, allowed "
         + (f"at least {low:g}" if unit == "dB" else f"at most {high:.3g}")
         + f" {unit}"
         for name, value, low, high, unit in list_noise_margins(
