@@ -167,8 +167,8 @@ def _excitation_lines(config: RunConfig) -> list[tuple[str, str]]:
     profile = config.profile
     if profile.continuation is not None:
         peak_m_s2 = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
-        least_gain = 1.0 / config.rig.table_response.max_correction
-        return _orbit_lines(profile.continuation, peak_m_s2 / GRAVITY_M_S2, least_gain)
+        max_correction = config.rig.table_response.max_correction
+        return _orbit_lines(profile.continuation, peak_m_s2 / GRAVITY_M_S2, max_correction)
     if profile.swept_sine is not None:
         return _swept_sine_lines(profile, profile.swept_sine)
     return _sweep_lines(profile) if profile.steps else _history_lines(profile)
@@ -213,7 +213,9 @@ def _limit_lines(profile: Profile) -> list[tuple[str, str]]:
     return [("limits", "; ".join(texts))] if texts else []
 
 
-def _orbit_lines(config: Continuation, peak_g: float, least_gain: float) -> list[tuple[str, str]]:
+def _orbit_lines(
+    config: Continuation, peak_g: float, max_correction: float
+) -> list[tuple[str, str]]:
     plan = config.orbit_plan
     orbits = plan.points
     unstable = [orbit for orbit in orbits if not orbit.stable]
@@ -231,8 +233,9 @@ def _orbit_lines(config: Continuation, peak_g: float, least_gain: float) -> list
             "feedback",
             f"at most {100 * config.max_feedback:g} % of the amplitude of the command, which "
             f"stays below {peak_g / max(levels_g):.4g} of its largest level with it, stops "
-            f"included: {peak_g:.4g} g for a table with a gain of 1, {peak_g / least_gain:.4g} g "
-            f"with the least gain accepted, {least_gain:.3g}; planned for a latency of "
+            f"included: {peak_g:.4g} g for a table with a gain of 1, "
+            f"{peak_g * max_correction:.4g} g with the largest correction of its gain, "
+            f"{max_correction:.3g}; planned for a latency of "
             f"{1e3 * plan.latency_s:.3g} ms and {1e3 * plan.jitter_s:.3g} ms of jitter",
         ),
         ("level", f"{extent}{max(levels_g):.4g} g peak table acceleration"),
