@@ -146,7 +146,7 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
     follow a smooth curve, within the range that amplitude control can correct. A drive relies on
     the table for which it was computed: gain and delay are then compared with what is expected of
     that table. The rig file states the ranges; below its least level friction holds the table back,
-    and no gain is too low.
+    and no gain is too low. What the noise at rest may change of a value is added to its range.
     """
     allowed = data.rig.table_response
     frequencies_hz, expected = data.frequencies_hz, data.expected_tones
@@ -159,33 +159,43 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         if not _has_clear_tone(data, name):
             continue
         tones = data.tones(name)
+        noise = KNOWN_SIGMAS * data.tone_errors(name)
+        relative_noise = noise / np.abs(tones)
         ratios = tones if expected is None else tones / expected
         polarity = float(np.cos(np.angle(tones[0])))
         yield make_check(data, "polarity against the command", name, polarity, 0.0, 1.0, "")
         least_gain = allowed.find_least_gain(float(frequencies_hz[0])) if is_stated else 0.0
-        gain_range = least_gain, allowed.gain[1]
+        gain_range = least_gain - noise[0], allowed.gain[1] + noise[0]
         yield make_check(data, "gain", name, abs(tones[0]), *gain_range, "")
         swept = np.flatnonzero(frequencies_hz <= data.profile.plan.high_hz * (1 + 1e-9))
         if swept.size > 1:
-            top_gain = abs(tones[swept[-1]])
-            top_range = allowed.top_gain if is_stated else (0.0, allowed.top_gain[1])
+            top = swept[-1]
+            top_gain, least_gain = abs(tones[top]), allowed.top_gain[0] if is_stated else 0.0
+            top_range = least_gain - noise[top], allowed.top_gain[1] + noise[top]
             yield make_check(data, "gain at the highest frequency", name, top_gain, *top_range, "")
         if expected is not None or swept.size > 2:
             label, logarithms = "gain off that of the drive", np.log(np.abs(ratios))
             if expected is None:
                 label, z = "gain off a smooth curve", frequencies_hz[swept] ** 2
                 logarithms = logarithms[swept] - np.polyval(np.polyfit(z, logarithms[swept], 1), z)
-            off, allowed_off = 100.0 * np.abs(logarithms).max(), allowed.gain_residual_percent
-            yield make_check(data, label, name, off, 0.0, limit(allowed_off), "%")
+            off = 100.0 * np.abs(logarithms).max()
+            max_off = allowed.gain_residual_percent + 100.0 * relative_noise[swept].max()
+            yield make_check(data, label, name, off, 0.0, limit(max_off), "%")
         delays = _find_delays(tones * np.sign(polarity), frequencies_hz)
-        longest = delays[np.argmax(np.abs(delays))]
-        yield make_check(data, "delay", name, longest, *DELAY_RANGE_MS, "ms")
+        delay_noise = 1e3 * relative_noise / (2 * math.pi * frequencies_hz)
+        longest = np.argmax(np.abs(delays))
+        low, high = DELAY_RANGE_MS
+        delay_range = low - delay_noise[longest], high + delay_noise[longest]
+        yield make_check(data, "delay", name, delays[longest], *delay_range, "ms")
         if frequencies_hz.size > 1:
             max_spread = max(
                 allowed.delay_spread_ms, MAX_DELAY_SPREAD_RATIO * abs(float(delays.mean()))
             )
             off_drive = " off that of the drive," if expected is not None else ""
-            spread = float(np.ptp(_find_delays(ratios * np.sign(polarity), frequencies_hz)))
+            differences = _find_delays(ratios * np.sign(polarity), frequencies_hz)
+            ends = [np.argmin(differences), np.argmax(differences)]
+            max_spread += float(np.linalg.norm(delay_noise[ends]))
+            spread = float(np.ptp(differences))
             label = f"delay{off_drive} over the frequencies"
             yield make_check(data, label, name, spread, 0.0, limit(max_spread), "ms")
 
