@@ -5,6 +5,7 @@ next visit to that frequency, in either direction.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -28,23 +29,27 @@ CANCELLED_RATIO = 10 ** (-15 / 20)  # of a harmonic at the first evaluation: can
 class Tuning:
     """Tuning state: the table's FRF at low level and the accepted corrections.
 
-    `max_correction` limits a correction and its inverse (`TableResponse.max_correction`).
+    `max_correction` limits a correction and its inverse (`TableResponse.max_correction`), and
+    `find_room` returns the largest one at (frequency in Hz, level in m/s2) for which the command
+    stays within the limits of the rig.
     """
 
     response: FrequencyResponse | None = None
     accepted: tuple[SineTarget, ...] = ()
     max_correction: float = TableResponse().max_correction
+    find_room: Callable[[float, float], float] | None = None
 
     def predict_target(self, step: Step) -> SineTarget:
         """Predict the start target of a step from this frequency, else from its neighbor."""
         for target in reversed(self.accepted):
             if target.frequency_hz == step.frequency_hz:
-                return replace(target, level_m_s2=step.acceleration_m_s2)
+                again = replace(target, level_m_s2=step.acceleration_m_s2)
+                return self.correct(again, target.correction)
         correction = self._inverse_gain(step.frequency_hz)
         if self.accepted:
             neighbour = self.accepted[-1]
             correction *= neighbour.correction / self._inverse_gain(neighbour.frequency_hz)
-        return SineTarget(step.frequency_hz, step.acceleration_m_s2, self.clamp(correction))
+        return self.correct(SineTarget(step.frequency_hz, step.acceleration_m_s2), correction)
 
     def add_accepted(self, target: SineTarget) -> "Tuning":
         """Return the tuning with one more accepted correction."""
@@ -57,9 +62,13 @@ class Tuning:
         """Return the complex FRF, table acceleration over command; 1 if none was identified."""
         return 1.0 + 0j if self.response is None else evaluate_transfer(self.response, frequency_hz)
 
-    def clamp(self, correction: float) -> float:
-        """Return the correction within its limit."""
-        return float(np.clip(correction, 1.0 / self.max_correction, self.max_correction))
+    def correct(self, target: SineTarget, correction: float) -> SineTarget:
+        """Return a target with a correction of its command, within its limits."""
+        largest = self.max_correction
+        if self.find_room is not None:
+            largest = min(largest, self.find_room(target.frequency_hz, target.level_m_s2))
+        clamped = float(np.clip(correction, 1.0 / self.max_correction, largest))
+        return replace(target, correction=clamped)
 
     def _inverse_gain(self, frequency_hz: float) -> float:
         return 1.0 / abs(self.transfer(frequency_hz))
@@ -82,7 +91,7 @@ def update_target(
     if abs(error) > ACCEPTED_TOLERANCE_SHARE * config.tolerance:
         max_factor = 10 ** (config.clamp_db / 20)
         factor = float(np.clip((1.0 + error) ** -config.gain, 1.0 / max_factor, max_factor))
-        new_target = replace(new_target, correction=tuning.clamp(target.correction * factor))
+        new_target = tuning.correct(target, target.correction * factor)
     if config.harmonics:
         new_target = replace(new_target, shape=_cancel_harmonics(target, measured, first, tuning))
     return new_target

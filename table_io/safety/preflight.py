@@ -512,6 +512,21 @@ def list_setup_warnings(profile: Profile, rig: RigConfig) -> list[str]:
     return messages
 
 
+def find_correction_room(
+    profile: Profile, rig: RigConfig, frequency_hz: float, level_m_s2: float
+) -> float:
+    """Return the largest correction of a level in m/s2 whose command is within a rig's limits."""
+    demand = _command_demand(profile, Step(0, "forward", frequency_hz, level_m_s2), 1.0)
+    peaks = [(limit.allowed, limit.demand(demand)) for limit in list_limits(rig)]
+    return min((allowed / peak for allowed, peak in peaks if peak > 0.0), default=math.inf)
+
+
+def _command_demand(profile: Profile, step: Step, correction: float) -> StepDemand:
+    """Return the demands of the corrected command of a held step, which moves no mass itself."""
+    d, v, a = (correction * peak for peak in _add_feedback(profile, step, _steady_peaks(step)))
+    return StepDemand(step.index, step.direction, step.frequency_hz, d, v, a, 0.0, math.inf)
+
+
 def check_corrected_drive(
     profile: Profile, steps: tuple[Step, ...], response: FrequencyResponse, rig: RigConfig
 ) -> list[str]:
@@ -525,11 +540,7 @@ def check_corrected_drive(
     rows, excessive = [], []
     for step in steps:
         correction = 1.0 / evaluate_gain(response, step.frequency_hz)
-        peaks = _add_feedback(profile, step, _steady_peaks(step))
-        d, v, a = (correction * peak for peak in peaks)
-        rows.append(
-            StepDemand(step.index, step.direction, step.frequency_hz, d, v, a, 0.0, math.inf)
-        )
+        rows.append(_command_demand(profile, step, correction))
         if correction > max_correction:
             excessive.append((correction, rows[-1]))
     faults = [

@@ -153,9 +153,12 @@ def _find_table_lag(state: SequencerState, frequency_hz: float) -> float:
     return change_s if response is None else change_s + _find_lag(response, frequency_hz)
 
 
-def _find_correction(state: SequencerState, frequency_hz: float, level_factor: float) -> float:
-    """Return the factor on the command that gives so many times the level, within its limit."""
-    return state.tuning.clamp(level_factor / abs(state.tuning.transfer(frequency_hz)))
+def _correct_sine(
+    state: SequencerState, frequency_hz: float, level_m_s2: float, level_factor: float
+) -> SineTarget:
+    """Return a sine whose command gives so many times the level, within its limits."""
+    correction = level_factor / abs(state.tuning.transfer(frequency_hz))
+    return state.tuning.correct(SineTarget(frequency_hz, level_m_s2), correction)
 
 
 def _config(state: SequencerState) -> Continuation:
@@ -224,8 +227,8 @@ def _append_orbit(
         trajectory, feedback = _engage(trajectory, feedback, step, blend_cycles)
     orbit, start = config.orbit_plan.points[step], trajectory.end
     from_rest = trajectory.target.level_m_s2 == 0.0
-    correction = _find_correction(state, frequency_hz, _search(state).level_factor)
-    sine = SineTarget(frequency_hz, orbit.acceleration_m_s2, correction)
+    level_factor = _search(state).level_factor
+    sine = _correct_sine(state, frequency_hz, orbit.acceleration_m_s2, level_factor)
     trajectory = trajectory.append_blend(sine, step, blend_cycles, Label.BLEND)
     count = math.ceil(blend_cycles * trajectory.rate_hz / frequency_hz)
     if not from_rest and trajectory.end - start < count:
@@ -346,9 +349,10 @@ def decide_orbit(state: SequencerState) -> SequencerState:
             f"{1e3 * fundamental(orbit.harmonics_m):.2g} mm"
         )
         return retry_orbit(replace(state, search=search), stage.last, reason)
-    correction = _find_correction(state, target.frequency_hz, search.level_factor)
-    command_m = orbit.acceleration_m_s2 * correction / w**2
-    level_ratio = abs(nominal) / orbit.acceleration_m_s2
+    level_m_s2 = orbit.acceleration_m_s2
+    sine = _correct_sine(state, target.frequency_hz, level_m_s2, search.level_factor)
+    command_m = sine.corrected_m_s2 / w**2
+    level_ratio = abs(nominal) / level_m_s2
     reason = _find_fault(config, target, measured, command_m, level_ratio)
     has_ended = not reason or target.update >= config.updates
     if has_ended:
@@ -382,9 +386,10 @@ def decide_orbit(state: SequencerState) -> SequencerState:
         state = replace(state, search=search, records=(*state.records, point))
         return _next_orbit(state)
     factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
-    correction = _find_correction(state, target.frequency_hz, search.level_factor * factor)
     # no more than the command can change
-    factor = correction * abs(state.tuning.transfer(target.frequency_hz)) / search.level_factor
+    sine = _correct_sine(state, target.frequency_hz, level_m_s2, search.level_factor * factor)
+    gain = abs(state.tuning.transfer(target.frequency_hz))
+    factor = sine.correction * gain / search.level_factor
     # The motion is corrected for the level that the table will have, not for that which it had.
     table_change = table_harmonics(
         target.frequency_hz, (factor - 1.0) * abs(nominal), plan.harmonics

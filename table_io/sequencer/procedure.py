@@ -18,6 +18,7 @@ ends at rest.
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -41,7 +42,7 @@ from table_io.excitation.trajectory import (
 from table_io.harmonics import HARMONIC_COUNT, HarmonicFit, mean_swing, track_harmonics
 from table_io.records import Check, Event, Level, Record, Step, StepAdded
 from table_io.safety import loop_check
-from table_io.safety.preflight import check_corrected_drive
+from table_io.safety.preflight import check_corrected_drive, find_correction_room
 from table_io.sequencer.orbits import (
     apply_feedback,
     begin_continuation,
@@ -370,7 +371,10 @@ def start_test(plan: TestPlan) -> SequencerState:
     trajectory, steps = start_trajectory(profile), profile.steps
     blend_cycles = profile.plan.blend_cycles
     targets = loop_check.plan_targets(profile, plan.rig) if profile.loop_check.enabled else ()
-    tuning = Tuning(max_correction=plan.rig.table_response.max_correction)
+    tuning = Tuning(
+        max_correction=plan.rig.table_response.max_correction,
+        find_room=partial(find_correction_room, profile, plan.rig),
+    )
     if not targets:
         initial = SequencerState(
             plan, trajectory, trajectory.to_drive(steps), Stage("end"), steps, tuning

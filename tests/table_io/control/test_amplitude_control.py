@@ -14,8 +14,10 @@ from table_io.control.table_response import evaluate_transfer
 from table_io.excitation.trajectory import SineTarget
 from table_io.harmonics import HarmonicFit, track_harmonics
 from table_io.records import FrequencyResponse, Level, Step
+from table_io.sequencer.procedure import make_test_plan, start_test
 from table_io.units import GRAVITY_M_S2
 from tests.builders.profiles import make_profile
+from tests.builders.rigs import change_rig
 from tests.builders.sessions import play_session
 
 A = 0.05 * GRAVITY_M_S2
@@ -215,4 +217,27 @@ def test_every_gain_that_a_rig_accepts_can_be_corrected(
     response = TableResponse(gain=gain, top_gain=top_gain)
     tuning = Tuning(max_correction=response.max_correction)
     for accepted in (*gain, *top_gain, 0.5, 2.0):
-        assert tuning.clamp(1.0 / accepted) == pytest.approx(1.0 / accepted)
+        corrected = tuning.correct(SineTarget(3.0, A), 1.0 / accepted)
+        assert corrected.correction == pytest.approx(1.0 / accepted)
+
+
+@pytest.mark.parametrize(
+    ("frequency_hz", "limits", "room"),
+    [
+        (0.5, {}, 60e-3 / (A / np.pi**2)),
+        (2.0, {"velocity_mm_s": 50.0}, 50e-3 / (A / (4 * np.pi))),
+        (5.0, {"acceleration_g": 0.06}, 1.2),
+        (5.0, {}, 5.0),  # by the gains that the rig accepts
+    ],
+)
+def test_level_control_keeps_a_command_within_the_limits_of_the_rig(
+    frequency_hz: float, limits: dict[str, float], room: float
+) -> None:
+    """The limits are checked at the gain of the loop check; at its level a table may have less."""
+    rig = change_rig(table_response={"top_gain": [0.2, 1.25]}, limits=limits)
+    tuning = start_test(make_test_plan(make_profile(), rig)).tuning
+    target, config = SineTarget(frequency_hz, A), ControlConfig()
+    for _ in range(9):
+        weak = make_fit(0.1 * A)
+        target = update_target(target, weak, weak, tuning, config)
+    assert target.correction == pytest.approx(room)

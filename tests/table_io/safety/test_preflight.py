@@ -16,7 +16,7 @@ from table_io.config.rig import RigConfig
 from table_io.config.sensor import CLIP_RATIO
 from table_io.errors import InputError
 from table_io.excitation.drive import Correction, Drive, HistorySegment, Segment
-from table_io.excitation.trajectory import plan_excitation, plan_sweep
+from table_io.excitation.trajectory import SineTarget, plan_excitation, plan_sweep
 from table_io.records import FrequencyResponse, Step
 from table_io.safety import preflight
 from table_io.safety.preflight import (
@@ -624,7 +624,8 @@ def test_command_is_corrected_for_every_gain_that_the_rig_accepts_and_no_less(
     part = f"step 0 (5 Hz forward): the table follows with a gain of {least:g}"
     assert all(warning.startswith(part) for warning in warnings)
     tuning = start_test(make_test_plan(make_test(), rig)).tuning
-    assert tuning.clamp(9.0) == pytest.approx(1.0 / least)
+    target = SineTarget(5.0, LEVEL_M_S2)
+    assert tuning.correct(target, 9.0).correction == pytest.approx(1.0 / least)
 
 
 def test_a_level_beside_break_points_is_not_ignored_silently() -> None:
