@@ -13,7 +13,7 @@ from typing import Protocol
 import numba
 import numpy as np
 import numpy.typing as npt
-from scipy.signal import butter, sosfilt
+from scipy.signal import butter, oaconvolve, sosfilt
 
 Float1D = npt.NDArray[np.float64]
 FINE_HZ = 16_000.0
@@ -180,10 +180,10 @@ class StepTest:
         a, rate = np.concatenate(amplitude), np.concatenate(phase)
         smooth = round(0.4 / dt)
         kernel = np.hanning(smooth) / np.hanning(smooth).sum()
-        a = np.convolve(np.concatenate([np.zeros(smooth), a, np.zeros(smooth)]), kernel, "same")
+        a = oaconvolve(np.concatenate([np.zeros(smooth), a, np.zeros(smooth)]), kernel, "same")
         # no table changes its velocity at once
         rate = np.concatenate([np.full(2 * smooth, rate[0]), rate, np.full(2 * smooth, rate[-1])])
-        rate = np.convolve(rate, kernel, "same")[smooth:-smooth]
+        rate = oaconvolve(rate, kernel, "same")[smooth:-smooth]
         disp = a * np.sin(np.cumsum(rate))
         disp = np.concatenate([np.zeros(round(rest_s / dt)), disp, np.zeros(round(0.5 / dt))])
         acc = np.gradient(np.gradient(disp, dt), dt)
