@@ -16,6 +16,7 @@ import numpy.typing as npt
 Float1D = npt.NDArray[np.float64]
 Float2D = npt.NDArray[np.float64]
 Int1D = npt.NDArray[np.int64]
+Int2D = npt.NDArray[np.int64]
 Bool1D = npt.NDArray[np.bool_]
 Bool2D = npt.NDArray[np.bool_]
 

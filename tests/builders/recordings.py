@@ -7,9 +7,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 
 from table_io.block import Block
+from table_io.records import Record
 from tests.builders.blocks import recut_blocks
 from tests.builders.profiles import AT_1_KHZ, NO_LOOP_CHECK, format_test
 
@@ -56,7 +58,8 @@ def log_file(bundle: "RunConfig", tmp_path_factory: pytest.TempPathFactory) -> P
     ]
     path = folder / "first" / "run.mcap"
     path.parent.mkdir()
-    items = sorted([*recording.items.records, *blocks], key=lambda item: item.index)
+    records = [item for item in recording.items if not isinstance(item, Block)]
+    items = sorted([*records, *blocks], key=lambda item: item.index)
     write_items(path, items, recording.start)
     return path
 
@@ -69,10 +72,17 @@ def recording(log_file: Path) -> "Recording":
 
 
 def store_items(items: "Iterable[Item]") -> "StoredItems":
-    """Return items as a recording holds them, blocks in columns of their own."""
-    from twin.recording.columns import BlockStore, StoredItems
+    """Return items as a recording holds them, blocks and comparisons in columns of their own."""
+    from twin.recording.columns import SeriesStore, StoredItems
+    from twin.transport.codec import topic_for
+    from twin.transport.series import SeriesItem, split_item
 
-    items = list(items)
-    count = sum(len(item) for item in items if isinstance(item, Block))
-    store = BlockStore(lambda _: count)
-    return StoredItems(store.add(item) if isinstance(item, Block) else item for item in items)
+    records: list[Record] = []
+    stores: dict[str, SeriesStore] = {}
+    for item in items:
+        if isinstance(item, SeriesItem):
+            store = stores.setdefault(topic_for(item), SeriesStore(lambda _: 10_000_000))
+            store.add(item, np.array([item.index]), *split_item(item))
+        else:
+            records.append(item)
+    return StoredItems(records, {topic: store.close() for topic, store in stores.items()})

@@ -25,7 +25,7 @@ from twin.recording.mcap_log import iter_messages, write_items
 from twin.recording.merge import merge, verify_log
 from twin.recording.reader import read_recording
 from twin.recording.recovery import recover_log
-from twin.recording.tabular import iter_batches, read_log_table
+from twin.recording.tabular import read_log_table
 
 GOLDEN = Path(__file__).parent / "golden"
 WRITTEN = {  # version: (sha256 of the content, messages, measured eta_d of each step)
@@ -118,12 +118,11 @@ def merged_of_a_killed_recorder(path: Path) -> None:
     [
         read_recording,
         read_log_table,
-        lambda path: iter_batches(path, 9),
         open_log,
         merge_alone,
         merged_of_a_killed_recorder,
     ],
-    ids=["read", "gather", "batches", "open_log", "merge", "merge_killed"],
+    ids=["read", "gather", "open_log", "merge", "merge_killed"],
 )
 def test_a_newer_version_is_refused_by_its_number(
     reader: Callable[[Path], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -11,10 +11,10 @@ from table_io.records import Event, Record
 from tests.recording.example_run import RATE_HZ, START, block, run
 from twin.exchange.export import ExportOptions, export_log
 from twin.log import open_log
-from twin.recording.mcap_log import LogWriter
-from twin.recording.reader import iter_valid_items, read_recording
+from twin.recording.mcap_log import LogWriter, write_items
+from twin.recording.reader import Recording, read_recording
 from twin.recording.recovery import recover_log
-from twin.recording.tabular import iter_batches, read_log_table
+from twin.recording.tabular import read_log_table
 from twin.transport.codec import Item, encode_item, topic_for
 
 
@@ -51,7 +51,7 @@ def test_a_recording_leaves_out_what_is_of_another_run(log: Path, true: Block) -
     assert meas.values.tobytes() == true.values.tobytes()
     assert not recording.is_intact
     assert [damage.reason for damage in recording.damage] == [
-        "/rig/meas: of another run", "/run/event: of another run",
+        "/run/event: of another run", "/rig/meas: of another run",
     ]  # fmt: skip
 
 
@@ -69,18 +69,6 @@ def test_rows_leave_it_out_and_are_not_whole(log: Path, true: Block) -> None:
 
 def test_export_reports_items_of_another_run(log: Path, tmp_path: Path) -> None:
     assert not export_log(ExportOptions(log, ("csv",), tmp_path / "a.csv")).is_intact
-
-
-def test_batches_leave_it_out(log: Path) -> None:
-    fed = iter_batches(log, 20)
-    assert fed is not None
-    items = [item for batch in fed for item in batch]
-    assert encode_item(items[0], START.run) == encode_item(START, START.run)
-    mine, theirs = (
-        sorted(encode_item(item, "") for item in some)
-        for some in (items, read_recording(log).items)
-    )
-    assert mine == theirs
 
 
 def test_open_log_is_whole_only_if_every_topic_is(log: Path, true: Block, tmp_path: Path) -> None:
@@ -105,17 +93,24 @@ def test_open_log_is_whole_only_if_every_topic_is(log: Path, true: Block, tmp_pa
         replace(block(20), channels=("drive_disp_m", "force_r1_n")),
         replace(block(20), label=np.full(20, 99)),
         START,
-        Event(2**60, "late", "after any run"),
+        Event(round(START.rate_hz * 1e7) + 1, "late", "after any run"),
     ],
     ids=["rate", "channels", "label", "start", "late"],
 )
-def test_iter_valid_items_filters_as_the_reader(odd: Block | Record) -> None:
-    reasons: list[str] = []
-    bad, good = encode_item(odd, START.run), encode_item(block(20), START.run)
-    assert list(iter_valid_items(topic_for(odd), [bad], START, reasons)) == []
-    assert bool(reasons) is (odd is not START)
-    assert len(list(iter_valid_items("/rig/meas", [b"\xff", good], START, reasons))) == 1
-    assert "not a Block" in reasons[-1]
+def test_a_recording_leaves_out_what_is_invalid(odd: Block | Record, tmp_path: Path) -> None:
+    """Also among the items of a series, the rest of which is in order."""
+    path = tmp_path / "run.mcap"
+    write_items(path, [*run(), odd], START)
+    recording = read_recording(path)
+    assert [damage.reason.split(":")[0] for damage in recording.damage] == [topic_for(odd)]
+    assert [encode_item(item, "") for item in recording.items] == [
+        encode_item(item, "") for item in sound(tmp_path / "sound.mcap").items
+    ]
+
+
+def sound(path: Path) -> Recording:
+    write_items(path, run(), START)
+    return read_recording(path)
 
 
 def test_foreign_messages_are_in_the_file(log: Path) -> None:

@@ -80,7 +80,7 @@ def test_replay_does_not_depend_on_block_size(
 def test_read_for_a_replay_is_the_same_as_read_whole(log_file: Path, recording: Recording) -> None:
     quick, whole = RecordedRun.open(log_file), recorded_in(recording)
     assert quick.comparisons == whole.comparisons
-    assert not quick.recording.records(Comparison)
+    assert len(quick.recording.comparisons) == len(whole.comparisons)
     assert not quick.recording.blocks("pred")
     assert quick.recording.contiguous_blocks("meas")[0].is_identical(
         recording.contiguous_blocks("meas")[0]

@@ -195,9 +195,9 @@ def test_a_saved_state_that_does_not_lead_to_the_hashes_is_not_used(
         replace(item, free=alter(item.free))
         if isinstance(item, PredictionHash) and item.free
         else item
-        for item in sparse.items.entries
+        for item in sparse.items.records
     ]
-    changed = Predictions(replace(sparse, items=StoredItems(entries)))
+    changed = Predictions(replace(sparse, items=StoredItems(entries, sparse.items.series)))
     (block,) = changed.read(5000, 9000)
     assert block.is_identical(whole)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -31,12 +31,13 @@ from twin.transport import shaketwin_pb2 as pb
 from twin.transport.codec import (
     Item,
     WireError,
-    decode_comparisons,
     decode_item,
+    decode_series,
     encode_comparisons,
     encode_item,
     topic_for,
 )
+from twin.transport.series import SeriesItem, join_item, split_item
 
 STREAM = Path(codec.__file__).parent
 ODD = (float("nan"), float("inf"), float("-inf"), -0.0, 5e-324, 1.7976931348623157e308)
@@ -340,38 +341,79 @@ def test_comparisons_at_once_have_the_bytes_of_each(run: str) -> None:
     assert encode_comparisons([], run) == []
 
 
-def decode_alone(payload: bytes) -> tuple[str, Item] | None:
+def decode_alone(topic: str, payload: bytes) -> tuple[str, Item] | None:
+    """Return run and item; None of what has no columns of equal lengths."""
     try:
-        return decode_item(endpoint.CMP_TOPIC, payload)
-    except WireError:
+        run, item = decode_item(topic, payload)
+        split_item(cast(SeriesItem, item))
+    except ValueError:
         return None
+    return run, item
+
+
+def decode_at_once(topic: str, payloads: list[bytes]) -> tuple[dict[int, tuple[str, Item]], int]:
+    """Return run and item by place, and the number of series."""
+    decoded: dict[int, tuple[str, Item]] = {}
+    errors: list[str] = []
+    all_series = list(decode_series(topic, payloads, errors))
+    for series in all_series:
+        size = series.values.shape[1] // series.places.size
+        for k, (place, index) in enumerate(zip(series.places, series.indices, strict=True)):
+            part = slice(k * size, (k + 1) * size)
+            columns = series.values[:, part], series.integers[:, part]
+            assert int(place) not in decoded
+            decoded[int(place)] = series.run, join_item(series.head, int(index), *columns)
+    assert len(decoded) + len(errors) == len(payloads)
+    return decoded, len(all_series)
+
+
+def make_series(names: tuple[str, ...], indices: list[int]) -> list[list[SeriesItem]]:
+    """Return comparisons and blocks at these samples."""
+    rng = np.random.default_rng(2)
+    sums = [map(tuple, rng.random((3, len(names))).tolist()) for _ in indices]
+    labels = rng.integers(-1, 9, (len(indices), 3, 5))
+    values = rng.standard_normal((len(indices), len(names), 5))
+    return [
+        [Comparison(index, 20, names, *own) for index, own in zip(indices, sums, strict=True)],
+        [
+            Block("meas", index, 2000.0, names, *own)
+            for index, *own in zip(indices, values, *labels.transpose(1, 0, 2), strict=True)
+        ],
+    ]
 
 
 @pytest.mark.parametrize("run", ["", "a", "r" * 200])
-def test_comparisons_decoded_at_once_are_those_decoded_one_by_one(run: str) -> None:
-    """Also of damaged ones, whose damage may lie in any byte: the others are not decoded."""
+@pytest.mark.parametrize("kind", [0, 1])
+def test_a_series_decoded_at_once_is_that_decoded_one_by_one(run: str, kind: int) -> None:
+    """Also of damaged ones, whose damage may lie in any byte."""
     rng = np.random.default_rng(2)
-    series = [
-        Comparison(index, 20, names, *(tuple(row) for row in rng.random((3, len(names))).tolist()))
-        for names in (("u", "a"), (), ("u", "b"))
-        for index in (0, 3, 127, 128, 300, 301, 2**40, 2**40 + 1)
-    ]
-    whole = encode_comparisons(series, run)
-    for first in range(0, len(series), 8):  # of one channel set each, as in a recording
-        expected = [(run, each) for each in series[first : first + 8]]
-        assert decode_comparisons(whole[first : first + 8]) == expected
-    assert decode_comparisons([]) == []
-    damaged = []
+    indices = [0, 3, 4, 127, 128, 300, 301, 2**40, 2**40 + 1]
+    topic = (endpoint.CMP_TOPIC, endpoint.MEAS_TOPIC)[kind]
+    whole = []
+    for names in (("u", "a"), (), ("u", "b")):
+        payloads = [encode_item(each, run) for each in make_series(names, indices)[kind]]
+        decoded, count = decode_at_once(topic, payloads)
+        assert count == 4  # one for each number of digits
+        for place, payload in enumerate(payloads):
+            assert decoded[place][0] == run
+            assert encode_item(decoded[place][1], run) == payload
+        whole += payloads
+    assert decode_at_once(topic, []) == ({}, 0)
+    mixed = []
     for payload in whole * 40:
         values = bytearray(payload)
         values[int(rng.integers(len(values)))] ^= 1 << int(rng.integers(8))
-        damaged.append(bytes(values))
-    mixed = [payload for pair in zip(whole * 40, damaged, strict=True) for payload in pair]
-    decoded = decode_comparisons(mixed)
-    assert sum(each is not None for each in decoded) > len(mixed) / 4
-    for payload, each in zip(mixed, decoded, strict=True):
-        if each is not None:
-            assert repr(each) == repr(decode_alone(payload))
+        mixed += [payload, bytes(values)]
+    decoded, _ = decode_at_once(topic, mixed)
+    for place, payload in enumerate(mixed):
+        alone = decode_alone(topic, payload)
+        assert (alone is None) == (place not in decoded)
+        if alone is not None:
+            assert decoded[place][0] == alone[0]
+            both = [cast(SeriesItem, item) for item in (decoded[place][1], alone[1])]
+            assert both[0].channels == both[1].channels
+            first, second = ([part.tobytes() for part in split_item(item)] for item in both)
+            assert first == second
 
 
 def test_a_flat_schema_has_its_columns_in_order() -> None:

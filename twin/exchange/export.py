@@ -3,14 +3,12 @@
 import mimetypes
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from table_io.channels import TIME_COLUMN
 from table_io.errors import InputError, require_package
 from table_io.formats.text import write_csv
-from table_io.records import RunStart
 from twin.exchange.fmu import write_fmu
 from twin.exchange.foxglove import build_layout, write_foxglove
 from twin.exchange.uff58 import write_uff58
@@ -21,7 +19,6 @@ from twin.recording.tabular import (
     UNIX_TIME_COLUMN,
     Columns,
     LogTable,
-    iter_batches,
     read_log_table,
 )
 from twin.results.contract import write_json
@@ -254,20 +251,10 @@ def _add_absolute_time(rows: LogTable) -> tuple[list[str], Iterable[Columns]]:
 
 
 def _write_rrd(path: Path, output_path: Path) -> None:
-    """Write a Rerun file in batches; a log that is out of order must fit into memory."""
-    from twin.viewer.view import BATCH_ITEMS, RerunView, write_rrd
+    """Write a Rerun file."""
+    from twin.viewer.view import write_rrd
 
-    batches = iter_batches(path, BATCH_ITEMS)
-    first = next(batches, None) if batches is not None else None
-    if batches is None or first is None or not isinstance(first[0], RunStart):
-        write_rrd(open_recording(path), output_path)
-        return
-    view = RerunView(first[0], save=output_path)
-    try:
-        for items in chain([first], batches):
-            view.feed(items)
-    finally:
-        view.close()
+    write_rrd(open_recording(path), output_path)
 
 
 def _output_path(file_format: str, base: Path) -> Path:

@@ -40,7 +40,6 @@ from table_io.records import (
 from table_io.sequencer.procedure import make_test_plan, nominal_drive
 from twin.monitor.recent import WINDOW_S, RecentSamples, TraceBuffer
 from twin.recording.validation import (
-    has_invalid_labels,
     validate_block,
     validate_record,
     validate_start,
@@ -259,7 +258,7 @@ def _expect_end(run_state: LiveRunState) -> ExpectedEnd | None:
 
 def _add_block(run_state: LiveRunState, block: Block, start: RunStart) -> LiveRunState:
     """Add a block; a block near sample 0 after later ones is a replay that starts again."""
-    if validate_block(block, None, start) or has_invalid_labels(block):
+    if validate_block(block, None, start):
         return run_state
     if block.stream != "meas":
         run_state.traces.add(block)

@@ -11,9 +11,10 @@ from tempfile import TemporaryDirectory
 
 from table_io.errors import InputError
 from table_io.records import RunStart
+from twin.recording.columns import TOPIC_ORDER
 from twin.recording.log_metadata import START_COPY_NAME, ContentHash, read_schema_version
 from twin.recording.mcap_log import LogWriter, iter_messages, read_leading_metadata, read_metadata
-from twin.recording.reader import START_TOPIC, TOPIC_ORDER
+from twin.recording.reader import START_TOPIC
 from twin.recording.recovery import UNFINISHED_REASON, LogMessage, ends_whole, recover_log
 from twin.recording.run_paths import PARTS_FOLDER
 from twin.system.files import lock_file

@@ -3,16 +3,25 @@
 import re
 import zlib
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar, cast
 
-from table_io.block import Block
+import numpy as np
+
+from table_io.block import Block, Int1D
 from table_io.errors import InputError
 from table_io.records import Event, Record, RunStart, RunStop, SampleGap
-from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
+from twin.recording.columns import (
+    PIECE_SAMPLES,
+    TOPIC_ORDER,
+    ComparisonTable,
+    Series,
+    SeriesStore,
+    StoredItems,
+)
 from twin.recording.log_metadata import START_COPY_NAME, read_schema_version
 from twin.recording.mcap_log import iter_messages, read_leading_metadata
 from twin.recording.recovery import (
@@ -20,11 +29,13 @@ from twin.recording.recovery import (
     Damage,
     LogMessage,
     RecoveredLog,
+    measure_log,
     pause_collection,
     recover_log,
 )
 from twin.recording.validation import (
-    has_invalid_labels,
+    MAX_DURATION_S,
+    has_invalid_numbers,
     validate_block,
     validate_record,
     validate_start,
@@ -34,20 +45,19 @@ from twin.transport.codec import (
     TOPIC_TYPES,
     Item,
     WireError,
-    decode_comparisons,
     decode_item,
+    decode_series,
     encode_item,
 )
 from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC
+from twin.transport.series import SeriesItem, split_item
 
 START_TOPIC = RECORD_TOPICS[RunStart]
-# Order of items with the same sample index: start first, then by table of topics, stop last. So a
-# recording reads the same in whatever order its parts were written.
-TOPIC_ORDER = {topic: place for place, topic in enumerate(TOPIC_TYPES)}
-TOPIC_ORDER |= {START_TOPIC: -1, RECORD_TOPICS[RunStop]: len(TOPIC_TYPES)}
 CUT_EVENT_KIND = "cut"  # says of which run a recording of some steps is a part
-DECODED_AT_ONCE = 10_000  # comparisons
-MIN_LABEL_BYTES = 3  # of the three labels of a sample, in any encoding
+SERIES_TOPICS = (*BLOCK_TOPICS.values(), CMP_TOPIC)
+MIN_COLUMN_BYTES = 3  # of a payload for each column, besides its float64 values: three labels
+DECODED_AT_ONCE = 10_000  # messages
+MessageHandler = Callable[[Sequence[LogMessage]], None]
 R = TypeVar("R", bound=Record)
 
 
@@ -74,11 +84,30 @@ class Recording:
 
     def blocks(self, stream: str) -> tuple[Block, ...]:
         """Return all blocks of stream "meas" or "pred", in order of sample index."""
-        return tuple(block.read() for block in self.items.stored_blocks(stream))
+        return self.items.blocks(stream)
 
     def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
         """Return the stream joined into one block between each pair of gaps."""
         return self.items.contiguous_blocks(stream)
+
+    def iter_pieces(self, stream: str) -> Iterator[Block]:
+        """Yield the contiguous blocks of a stream in pieces, see `cut_block`."""
+        for block in self.contiguous_blocks(stream):
+            yield from self.cut_block(block, PIECE_SAMPLES)
+
+    def cut_block(self, block: Block, samples: int) -> Iterator[Block]:
+        """Yield a block of this recording in pieces of so many samples.
+
+        The memory of a piece is given back when the next one is asked for.
+        """
+        for first in range(block.index, block.end, samples):
+            yield block.cut(first, min(first + samples, block.end))
+            self.items.release()
+
+    @property
+    def comparisons(self) -> ComparisonTable:
+        """Comparisons as numbers, in order; those of the channels that most of them have."""
+        return self.items.comparison_table()
 
     @property
     def stop(self) -> RunStop | None:
@@ -110,37 +139,46 @@ class Recording:
         return end - self.start.index - sum(len(piece) for piece in pieces)
 
 
-def read_recording(path: Path, topics: Iterable[str] = TOPIC_TYPES) -> Recording:
+@pause_collection()
+def read_recording(
+    path: Path,
+    topics: Iterable[str] = TOPIC_TYPES,
+    handlers: Mapping[str, MessageHandler] | None = None,
+) -> Recording:
     """Read the recording in `path`, with its start record and the items of `topics`.
 
-    Raises InputError if it is not a shaketwin log. A damaged log is read as far as possible;
-    `damage` lists the rest.
+    Messages of the topics of `handlers` go to these as they are, some at a time. Raises InputError
+    if it is not a shaketwin log. A damaged log is read as far as possible; `damage` lists the rest.
     """
-    return build_recording(path, recover_log(path, frozenset((START_TOPIC, *topics))))
+    decoder, decoded = _Decoder(measure_log(path)), {START_TOPIC, *topics}
+    handlers = handlers or {}
 
+    def handle(messages: list[LogMessage]) -> None:
+        for topic, handler in handlers.items():
+            handler([message for message in messages if message.topic == topic])
+        decoder.add([message for message in messages if message.topic in decoded])
 
-def find_topic(entry: StoredItem) -> str:
-    """Return the topic on which an item is logged, as `topic_for` does."""
-    if isinstance(entry, StoredBlock):
-        return BLOCK_TOPICS[entry.stream]
-    return RECORD_TOPICS[type(entry)]
-
-
-def build_recording(path: Path, recovered: RecoveredLog) -> Recording:
-    """Return the recording in a recovered log, whose messages are removed as they are decoded."""
-    return _select_recording(path, recovered, keeps_messages=False)[0]
-
-
-def select_messages(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
-    """Return (recording, message of each of its items) from a recovered log."""
-    return _select_recording(path, recovered, keeps_messages=True)
+    recovered = recover_log(path, frozenset({*decoded, *handlers}), handle)
+    return _select_recording(path, recovered, decoder)[0]
 
 
 @pause_collection()
+def select_messages(path: Path, recovered: RecoveredLog) -> tuple[Recording, list[LogMessage]]:
+    """Return (recording, message of each of its items) from a recovered log."""
+    messages = recovered.messages
+    decoder = _Decoder(sum(len(message.payload) for message in messages))
+    recording, numbers = _select_recording(path, recovered, decoder)
+    order = recording.items.order.tolist()
+    return recording, [recovered.messages[numbers[source][place]] for source, place in order]
+
+
 def _select_recording(
-    path: Path, recovered: RecoveredLog, keeps_messages: bool
-) -> tuple[Recording, list[LogMessage]]:
-    """Return (recording, message of each of its items if they are kept)."""
+    path: Path, recovered: RecoveredLog, decoder: "_Decoder"
+) -> tuple[Recording, list[Int1D]]:
+    """Return (recording, numbers of the messages of its items), after the last are decoded.
+
+    Messages are numbered as they are decoded; numbers are by source, see `StoredItems.order`.
+    """
     problems = _assign_unnamed_topics(recovered)
     topics_present = {*recovered.topics, *(message.topic for message in recovered.messages)}
     if topics_present and not topics_present & TOPIC_TYPES.keys():
@@ -150,15 +188,16 @@ def _select_recording(
             where=path,
             remedy="give the run.mcap of a run",
         )
-    store = _make_store(recovered.messages)
-    messages = iter(recovered.messages) if keeps_messages else _take_messages(recovered)
-    known = (message for message in messages if message.topic in TOPIC_TYPES)
-    entries, errors = _decode_messages(known, store, keeps_messages)
-    start = _find_start(path, entries, errors, recovered.attachments.get(START_COPY_NAME))
-    problems += _remove_mislabelled(entries, store)
-    entries.sort(key=lambda entry: (entry.item.index, TOPIC_ORDER[entry.topic], entry.key))
-    kept, rejected = _select_valid(entries, start, recovered.is_intact)
+    for first in range(0, len(recovered.messages), DECODED_AT_ONCE):
+        decoder.add(recovered.messages[first : first + DECODED_AT_ONCE])
+    start = _find_start(path, decoder, recovered)
+    records, own, rejected = decoder.select_records(start, recovered.is_intact)
+    series, numbers = {}, [own]
     problems += rejected
+    for topic in SERIES_TOPICS:
+        series[topic], own, rejected = decoder.select_series(topic, start, recovered.is_intact)
+        numbers.append(own)
+        problems += rejected
     try:
         read_schema_version(path, recovered.metadata)
     except InputError as error:
@@ -167,19 +206,14 @@ def _select_recording(
         problems.append(str(error))  # the version may be damaged: read the rest
     damage = (
         *recovered.damage,
-        *(Damage(0, 0, text) for text in (*_count_repeats(errors), *_count_repeats(problems))),
+        *(
+            Damage(0, 0, text)
+            for text in (*_count_repeats(decoder.errors), *_count_repeats(problems))
+        ),
     )
-    items = StoredItems(entry.item for entry in kept)
+    items = StoredItems(records, series)
     extras = recovered.metadata, recovered.attachments
-    recording = Recording(path, start.run, start, items, not damage, damage, *extras)
-    return recording, [entry.message for entry in kept if entry.message is not None]
-
-
-def _take_messages(recovered: RecoveredLog) -> Iterator[LogMessage]:
-    """Yield the messages in their order, each of which is removed."""
-    recovered.messages.reverse()
-    while recovered.messages:
-        yield recovered.messages.pop()
+    return Recording(path, start.run, start, items, not damage, damage, *extras), numbers
 
 
 def _assign_unnamed_topics(recovered: RecoveredLog) -> list[str]:
@@ -244,135 +278,162 @@ def read_start(path: Path) -> RunStart:
     return start if isinstance(start, RunStart) and is_valid else read_recording(path, ()).start
 
 
-def iter_valid_items(
-    topic: str, payloads: Iterable[bytes], start: RunStart, problems: list[str]
-) -> Iterator[Item]:
-    """Yield the items of a topic that are valid in the run of `start`, without start records.
-
-    These are the rules of `read_recording` for streaming; reasons of rejection are appended to
-    `problems`. Repeated samples are not detected: the caller selects among them.
-    """
-    messages = [LogMessage(topic, 0, payload) for payload in payloads]
-    store = _make_store(messages)
-    entries, errors = _decode_messages(messages, store)
-    problems += errors
-    problems += _remove_mislabelled(entries, store)
-    for entry in entries:
-        if reason := _rejection_reason(entry, None, start):
-            problems.append(f"{topic}: {reason}")
-        elif not isinstance(entry.item, RunStart):
-            yield entry.item.read() if isinstance(entry.item, StoredBlock) else entry.item
-
-
 class _Entry(NamedTuple):
     """Decoded message; `key` tells it from others of its topic and index."""
 
     topic: str
     sequence: int
-    key: bytes  # the payload, or the checksum of that of a block, which is large
-    item: StoredItem
+    key: bytes  # the payload, or of a series, which are large and many, its checksum
+    item: Item
     run: str
-    message: LogMessage | None = None  # where it is kept
+    number: int  # of the message as they were decoded; of a series, of the item in it
 
 
-def _rejection_reason(entry: _Entry, before: StoredBlock | None, start: RunStart) -> str:
+def _rejection_reason(entry: _Entry, before: Block | None, start: RunStart) -> str:
     """Return why an item is invalid in the run of `start` after block `before`, or ""."""
     if entry.run != start.run:
         return "of another run"
-    if isinstance(entry.item, StoredBlock):
+    if isinstance(entry.item, Block):
         return validate_block(entry.item, before, start)
     return validate_record(entry.item, start)
 
 
-def _make_store(messages: Sequence[LogMessage]) -> BlockStore:
-    """Return a store with room for all blocks that these messages may hold."""
-    size = sum(len(message.payload) for message in messages)
-    return BlockStore(lambda block: size // (8 * len(block.channels) + MIN_LABEL_BYTES))
+class _Decoder:
+    """Decodes messages as they are read: records, and the series of a topic into columns."""
+
+    def __init__(self, content_bytes: int) -> None:
+        self.entries: list[_Entry] = []  # of records
+        self.errors: list[str] = []  # of messages that do not decode
+        self.count = 0
+        self._stores = {
+            topic: SeriesStore(lambda rows: content_bytes // (8 * rows + MIN_COLUMN_BYTES))
+            for topic in SERIES_TOPICS
+        }
+        # Number and sequence of the message of each item of a series, and number of its run.
+        self._origins = {topic: [np.empty((3, 0), np.int64)] for topic in SERIES_TOPICS}
+        self._runs: dict[str, int] = {}
+        self._unusual: set[str] = set()  # topics with a number out of range
+
+    def add(self, messages: Sequence[LogMessage]) -> None:
+        """Decode messages, in any order."""
+        numbers: dict[str, list[int]] = {}
+        for number, message in enumerate(messages):
+            numbers.setdefault(message.topic, []).append(number)
+        for topic in numbers.keys() & TOPIC_TYPES.keys():
+            selected = [messages[number] for number in numbers[topic]]
+            if topic in self._stores:
+                self._add_series(topic, selected, self.count + np.array(numbers[topic]))
+                continue
+            for number, message in zip(numbers[topic], selected, strict=True):
+                try:
+                    run, item = decode_item(topic, message.payload)
+                except WireError as error:
+                    self.errors.append(str(error))
+                    continue
+                origin = message.sequence, message.payload
+                self.entries.append(_Entry(topic, *origin, item, run, self.count + number))
+        self.count += len(messages)
+
+    def _add_series(self, topic: str, messages: list[LogMessage], numbers: Int1D) -> None:
+        sequences = np.array([message.sequence for message in messages])
+        payloads = [message.payload for message in messages]
+        for series in decode_series(topic, payloads, self.errors):
+            places, run, head, index, values, integers = series
+            if has_invalid_numbers(head, values, integers):
+                self._unusual.add(topic)
+            self._stores[topic].add(head, index, values, integers)
+            runs = np.full_like(places, self._runs.setdefault(run, len(self._runs)))
+            self._origins[topic].append(np.array([numbers[places], sequences[places], runs]))
+
+    def select_records(
+        self, start: RunStart, is_intact: bool
+    ) -> tuple[list[Record], Int1D, list[str]]:
+        """Return the valid records in order, the numbers of their messages, and problems."""
+        kept, problems = _select_valid(self.entries, start, is_intact)
+        self.entries.clear()  # with their payloads
+        numbers = np.array([entry.number for entry in kept], np.int64)
+        return [cast(Record, entry.item) for entry in kept], numbers, problems
+
+    def select_series(
+        self, topic: str, start: RunStart, is_intact: bool
+    ) -> tuple[Series, Int1D, list[str]]:
+        """Return the valid items of a topic in order, the numbers of their messages, and problems.
+
+        The usual series, of one run and in order, is valid as its first item is.
+        """
+        arrived = self._stores.pop(topic).close()
+        numbers, sequences, runs = np.concatenate(self._origins.pop(topic), axis=1)
+        order = np.argsort(arrived.index, kind="stable")
+        series = arrived.take(order)
+        problems: list[str] = []
+        if not self._is_usual(topic, series, start):
+            names = list(self._runs)
+            entries = [
+                _Entry(topic, sequence, _find_key(item), item, names[run], place)
+                for place, (item, sequence, run) in enumerate(
+                    zip(arrived, sequences.tolist(), runs.tolist(), strict=True)
+                )
+            ]
+            kept, problems = _select_valid(entries, start, is_intact)
+            order = np.array([entry.number for entry in kept], np.int64)
+            series = arrived.take(order)
+        return series, numbers[order], problems
+
+    def _is_usual(self, topic: str, series: Series, start: RunStart) -> bool:
+        """Return whether all items in this order are like the first of them, which is valid."""
+        if not len(series):
+            return True
+        end = series.index + series.places[:, 1]
+        first = _Entry(topic, 0, b"", series.read(0), start.run, 0)
+        return (
+            [*self._runs] == [start.run]
+            and topic not in self._unusual
+            and len(series.columns) == 1
+            and not _rejection_reason(first, None, start)
+            and bool((series.places[:, 1] > 0).all() and (series.index[1:] >= end[:-1]).all())
+            and end[-1] <= start.rate_hz * MAX_DURATION_S
+        )
 
 
-def _decode_messages(
-    messages: Iterable[LogMessage], store: BlockStore, keeps_messages: bool = False
-) -> tuple[list[_Entry], list[str]]:
-    """Return (decoded messages, errors of those that do not decode); blocks go into `store`."""
-    entries: list[_Entry] = []
-    errors = []
-    for message, decoded in _iter_decoded(messages):
-        topic, payload = message.topic, message.payload
-        try:
-            run, item = decoded or decode_item(topic, payload)
-        except WireError as error:
-            errors.append(str(error))
-            continue
-        kept = message if keeps_messages else None
-        if isinstance(item, Block):
-            key = zlib.crc32(payload).to_bytes(4)
-            entries.append(_Entry(topic, message.sequence, key, store.add(item), run, kept))
-        else:
-            entries.append(_Entry(topic, message.sequence, payload, item, run, kept))
-    return entries, errors
+def _find_key(item: SeriesItem) -> bytes:
+    """Return the checksum of the numbers of an item."""
+    return zlib.crc32(b"".join(part.tobytes() for part in split_item(item))).to_bytes(4)
 
 
-def _iter_decoded(
-    messages: Iterable[LogMessage],
-) -> Iterator[tuple[LogMessage, tuple[str, Item] | None]]:
-    """Yield each message, in any order, with its content where many were decoded at once."""
-    compared: list[LogMessage] = []
-    for message in messages:
-        if message.topic != CMP_TOPIC:
-            yield message, None
-            continue
-        compared.append(message)
-        if len(compared) == DECODED_AT_ONCE:
-            yield from zip(
-                compared, decode_comparisons([each.payload for each in compared]), strict=True
-            )
-            compared = []
-    yield from zip(compared, decode_comparisons([each.payload for each in compared]), strict=True)
-
-
-def _find_start(
-    path: Path, entries: list[_Entry], errors: list[str], copy: bytes | None
-) -> RunStart:
+def _find_start(path: Path, decoder: _Decoder, recovered: RecoveredLog) -> RunStart:
     """Return the start record or its copy; raise InputError if both are missing."""
-    problems = [*errors]
-    for entry in entries:
+    problems = [*decoder.errors]
+    for entry in decoder.entries:
         if isinstance(entry.item, RunStart):
             if not (reason := validate_start(entry.item)):
                 return entry.item
             problems.append(f"{START_TOPIC}: {reason}")
-    copies = [] if copy is None else [LogMessage(START_TOPIC, 0, copy)]
-    for entry in _decode_messages(copies, _make_store(copies), keeps_messages=True)[0]:
-        if isinstance(entry.item, RunStart):
-            entries.append(entry)
-            errors.append(f"{START_TOPIC}: lost; its copy is used")
-            return entry.item
+    if (copy := recovered.attachments.get(START_COPY_NAME)) is not None:
+        recovered.messages.append(LogMessage(START_TOPIC, 0, copy))
+        decoder.add(recovered.messages[-1:])
+        item = decoder.entries[-1].item if decoder.entries else None
+        if isinstance(item, RunStart):
+            decoder.errors.append(f"{START_TOPIC}: lost; its copy is used")
+            return item
     if problems:
         raise InputError(f"damaged or foreign: {problems[0]}", where=path, key=START_TOPIC)
     raise InputError("missing, so profile and model are unknown", where=path, key=START_TOPIC)
 
 
-def _remove_mislabelled(entries: list[_Entry], store: BlockStore) -> list[str]:
-    """Remove blocks with impossible labels; return a problem for each."""
-    if not any(has_invalid_labels(block) for block in store.read_all()):
-        return []
-    count = len(entries)
-    entries[:] = [
-        entry
-        for entry in entries
-        if not (isinstance(entry.item, StoredBlock) and has_invalid_labels(entry.item.read()))
-    ]
-    return ["samples with invalid labels"] * (count - len(entries))
-
-
 def _select_valid(
     entries: list[_Entry], start: RunStart, is_intact: bool
 ) -> tuple[list[_Entry], list[str]]:
-    """Return (entries that are valid together in one run, reasons of rejection of the others)."""
+    """Return (entries that are valid together in one run, reasons of rejection of the others).
+
+    In order of sample index.
+    """
     kept: list[_Entry] = []
     problems = []
-    last_blocks: dict[str, StoredBlock] = {}
+    last_blocks: dict[str, Block] = {}
     seen_keys: set[tuple[str, int, bytes]] = set()
-    for entry in entries:
+    for entry in sorted(
+        entries, key=lambda entry: (entry.item.index, TOPIC_ORDER[entry.topic], entry.key)
+    ):
         topic, item = entry.topic, entry.item
         if not is_intact:  # a repeated chunk repeats each of its messages
             key = (topic, entry.sequence, entry.key)
@@ -380,12 +441,12 @@ def _select_valid(
                 problems.append(f"{topic}: duplicate message")
                 continue
             seen_keys.add(key)
-        before = last_blocks.get(item.stream) if isinstance(item, StoredBlock) else None
+        before = last_blocks.get(item.stream) if isinstance(item, Block) else None
         reason = _rejection_reason(entry, before, start)
         if item is not start and (reason or isinstance(item, RunStart)):
             problems.append(f"{topic}: {reason or 'duplicate message'}")
             continue
-        if isinstance(item, StoredBlock):
+        if isinstance(item, Block):
             last_blocks[item.stream] = item
         kept.append(entry)
     return kept, problems

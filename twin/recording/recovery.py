@@ -13,8 +13,8 @@ import gc
 import os
 import struct
 import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
@@ -211,16 +211,29 @@ def pause_collection() -> Iterator[None]:
             gc.enable()
 
 
+def measure_log(path: Path) -> int:
+    """Return the size of the content of a log in bytes, decompressed, up to the first damage."""
+    with suppress(OSError), path.open("rb") as file:
+        return _Scanner(file, file.seek(0, 2), None).measure()
+    return 0
+
+
 @pause_collection()
-def recover_log(path: Path, topics: frozenset[str] | None = None) -> RecoveredLog:
+def recover_log(
+    path: Path,
+    topics: frozenset[str] | None = None,
+    handle: Callable[[list[LogMessage]], None] | None = None,
+) -> RecoveredLog:
     """Recover the readable content of `path`, only of `topics` if given.
 
-    Raises InputError if it is not an MCAP file, or does not fit into memory.
+    Messages go to `handle`, some at a time, as they are read: in the result are only those whose
+    topic was unknown then. Raises InputError if it is not an MCAP file, or does not fit into
+    memory.
     """
     try:
         with path.open("rb") as file:
             size = file.seek(0, 2)
-            scanner = _Scanner(file, size, topics)
+            scanner = _Scanner(file, size, topics, handle)
             if not scanner.is_mcap():
                 raise InputError(
                     "not an MCAP file", where=path, remedy="give the run.mcap of a run"
@@ -247,6 +260,7 @@ class _Scanner:
     file: BinaryIO
     size: int
     wanted_topics: frozenset[str] | None
+    handle: Callable[[list[LogMessage]], None] | None = None
     recovered: RecoveredLog = field(default_factory=RecoveredLog)
     topic_by_channel: dict[int, str] = field(default_factory=dict)
     skipped_channels: set[int] = field(default_factory=set)  # of unwanted topics
@@ -262,6 +276,24 @@ class _Scanner:
         if MAGIC.startswith(start[: len(MAGIC)]) or end == MAGIC:
             return True
         return len(start) == 17 and start[8] == HEADER and UINT64.unpack_from(start, 9)[0] < 1000
+
+    def measure(self) -> int:
+        """Return the size of the records up to the first damage in bytes, of chunks decompressed.
+
+        No more than may be read.
+        """
+        offset, size = len(MAGIC), 0
+        with suppress(InvalidRecordError):
+            while True:
+                opcode, length = self._read_header(offset)
+                offset += RECORD_HEADER.size
+                size += (
+                    read_uncompressed_size(self._read_at(offset, CHUNK_HEADER.size))
+                    if opcode == CHUNK
+                    else length
+                )
+                offset += length
+        return min(size, work_limit(self.size))
 
     def run(self) -> RecoveredLog:
         """Read the file to its end, skipping damage."""
@@ -348,7 +380,7 @@ class _Scanner:
             content, zlib.crc32(RECORD_HEADER.pack(opcode, len(content)), previous_crc)
         )
         if opcode == CHUNK:
-            self.recovered.messages += self._parse_messages(self._decompress(content))
+            self._add(self._parse_messages(self._decompress(content)))
         elif opcode == DATA_END:
             self._check_crc(
                 content, previous_crc, offset, "the data differ from those that were written"
@@ -367,9 +399,15 @@ class _Scanner:
             self._reserve_memory(16 * len(content))  # pairs of short strings
             self.recovered.metadata.setdefault(name, parse_string_map(content, end))
         else:
-            self.recovered.messages += self._parse_messages(
-                RECORD_HEADER.pack(opcode, len(content)) + content
-            )
+            self._add(self._parse_messages(RECORD_HEADER.pack(opcode, len(content)) + content))
+
+    def _add(self, messages: list[LogMessage]) -> None:
+        """Hand messages over, or keep them; those whose channel record is yet to come are kept."""
+        if self.handle is not None and messages:
+            unnamed = {f"{UNNAMED_TOPIC_PREFIX}{number}" for number in self.unnamed_channels}
+            self.handle([message for message in messages if message.topic not in unnamed])
+            messages = [message for message in messages if message.topic in unnamed]
+        self.recovered.messages += messages
 
     def _check_crc(self, content: bytes, crc: int, offset: int, reason: str) -> None:
         """Record damage if the CRC at the end of `content` differs in an otherwise sound file."""

@@ -4,9 +4,10 @@ Code that works on a recording may rely on these checks.
 """
 
 import math
-from itertools import chain
 
-from table_io.block import Block, Label
+import numpy as np
+
+from table_io.block import Block, Float2D, Int2D, Label
 from table_io.records import (
     Agreement,
     Comparison,
@@ -23,13 +24,16 @@ from table_io.records import (
     StepAdded,
     SweepLevel,
 )
-from twin.recording.columns import StoredBlock
+from twin.transport.series import SeriesItem, split_item
 
 DIRECTIONS = ("forward", "backward")
 MAX_STEPS = 100_000
 MAX_CYCLES = 10_000_000
 MAX_FREQUENCY_HZ = 1e7
 MAX_DURATION_S = 1e7  # four months
+# Of step, label and cycle of a sample, (3, 1).
+MIN_LABELS = np.array([[-1], [min(Label)], [-1]])
+MAX_LABELS = np.array([[MAX_STEPS], [max(Label)], [MAX_CYCLES]])
 
 
 def validate_start(start: RunStart) -> str:
@@ -60,9 +64,7 @@ def _is_valid_step(step: Step) -> bool:
     )
 
 
-def validate_block(
-    block: Block | StoredBlock, before: Block | StoredBlock | None, start: RunStart
-) -> str:
+def validate_block(block: Block, before: Block | None, start: RunStart) -> str:
     """Return why a block is invalid after block `before` of its stream, or ""."""
     if block.rate_hz != start.rate_hz:
         return "the sampling rate is not that of the run"
@@ -74,17 +76,17 @@ def validate_block(
         return "the channels differ from earlier blocks"
     if before is not None and block.index < before.end:
         return "duplicate samples"
-    return ""
+    return "samples with invalid labels" if has_invalid_numbers(block, *split_item(block)) else ""
 
 
-def has_invalid_labels(block: Block) -> bool:
-    """Return whether any step, label or cycle of a block is out of range."""
-    limits = {"step": (-1, MAX_STEPS), "label": (0, max(Label)), "cycle": (-1, MAX_CYCLES)}
-    for name, (minimum, maximum) in limits.items():
-        labels = getattr(block, name)
-        if labels.size and (labels.min() < minimum or labels.max() > maximum):
-            return True
-    return False
+def has_invalid_numbers(head: SeriesItem, values: Float2D, integers: Int2D) -> bool:
+    """Return whether a label of blocks, or a sum of squares of comparisons, is out of range.
+
+    `values` and `integers` are the columns of any number of items like `head`.
+    """
+    if isinstance(head, Comparison):
+        return bool((values < 0).any())
+    return bool(((integers < MIN_LABELS) | (integers > MAX_LABELS)).any())
 
 
 def validate_record(record: Record, start: RunStart) -> str:
@@ -119,8 +121,7 @@ def _validate_fields(record: Record) -> str:
         return "columns of unequal lengths"
     match record:
         case Comparison():
-            sums = chain(record.measured_ss, record.free_error_ss, record.window_error_ss)
-            if any(map((0.0).__gt__, sums)):
+            if has_invalid_numbers(record, *split_item(record)):
                 return "negative sum of squares"
         case CycleExtremes() | Level():
             if record.step > MAX_STEPS:

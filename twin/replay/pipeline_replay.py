@@ -33,11 +33,10 @@ from twin.recording.log_metadata import select_recorded
 from twin.recording.reader import (
     CUT_EVENT_KIND,
     Recording,
-    build_recording,
     read_recording,
     read_start,
 )
-from twin.recording.recovery import recover_log
+from twin.recording.recovery import LogMessage
 from twin.results.rerun import TWIN_RECORDS, is_rig_item, rerun_twin
 from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import ItemHandler, record_items
@@ -116,26 +115,25 @@ class RecordedRun:
         own_topics = {CMP_TOPIC, TIMING_TOPIC, HASH_TOPIC}
         if read_start(path).predictions_every:
             own_topics.add(PRED_TOPIC)
-        recovered = recover_log(path, frozenset(TOPIC_TYPES.keys() - TWIN_TOPICS | own_topics))
-        own = [message for message in recovered.messages if message.topic in own_topics]
-        recovered.messages = [
-            message for message in recovered.messages if message.topic not in own_topics
-        ]
-        recording = build_recording(path, recovered)
+        own: dict[str, list[LogMessage]] = {topic: [] for topic in own_topics}
+        handlers = {topic: messages.extend for topic, messages in own.items()}
+        recording = read_recording(path, TOPIC_TYPES.keys() - TWIN_TOPICS | {CMP_TOPIC}, handlers)
         rate = recording.start.rate_hz
-        payloads: dict[str, dict[int, bytes]] = {topic: {} for topic in own_topics}
-        timing_ends = [-1]
-        for message in own:
-            payloads[message.topic][round(message.log_time * rate / 1e9)] = message.payload
-            if message.topic == TIMING_TOPIC:
-                timing = _decode(TIMING_TOPIC, message.payload)
-                if isinstance(timing, Timing) and timing.component == "twin":
-                    timing_ends.append(timing.index)
+        payloads = {
+            topic: {round(message.log_time * rate / 1e9): message.payload for message in messages}
+            for topic, messages in own.items()
+        }
+        timings = (_decode(TIMING_TOPIC, message.payload) for message in own[TIMING_TOPIC])
+        twin_timings = (
+            timing.index
+            for timing in timings
+            if isinstance(timing, Timing) and timing.component == "twin"
+        )
         hashes = (_decode(HASH_TOPIC, payload) for payload in payloads[HASH_TOPIC].values())
         return cls(
             recording,
             payloads[CMP_TOPIC],
-            max(timing_ends),
+            max(twin_timings, default=-1),
             {item.index: item for item in hashes if isinstance(item, PredictionHash)},
             payloads.get(PRED_TOPIC, {}),
         )

@@ -3,9 +3,8 @@
 from pathlib import Path
 
 from table_io.errors import InputError
-from table_io.records import Comparison
 from twin.log import Log
-from twin.recording.reader import Recording, iter_valid_items, read_start
+from twin.recording.reader import Recording, read_start
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import parse_step_range
 from twin.replay.pipeline_replay import (
@@ -26,7 +25,6 @@ from twin.setup.run_config import RunConfig
 from twin.setup.unpaced import Observe, ShownRun, observe_nothing
 from twin.setup.warm_up import compile_kernels
 from twin.system.versions import find_version_changes
-from twin.transport.endpoint import CMP_TOPIC
 
 RECORDED = "recorded"  # model name: the model stored in the log
 
@@ -118,8 +116,6 @@ def describe_replay(
     """Compare a replay with its recording."""
     recording = recorded.recording
     same = config.model_toml == recording.start.model_toml
-    payloads = [payload for _, payload in sorted(recorded.comparisons.items())]
-    recorded_items = [*iter_valid_items(CMP_TOPIC, payloads, recording.start, [])]
     return ReplayResult(
         of=str(recording.path),
         run=recording.run,
@@ -142,7 +138,7 @@ def describe_replay(
         relative_difference=compute_deviation(recording.path, log) if identity.differs else {},
         versions_differing=find_version_changes(recording.start.versions),
         recorded_comparison=summaries.channel_nrmse(
-            tuple(item for item in recorded_items if isinstance(item, Comparison)),
+            recording.comparisons,
             config.parameters,
             config.rig.channel_by_name,
             summaries.find_channel_noise(recording),

@@ -1,10 +1,10 @@
 """Figures of a run, arranged and colored as in Stefani, De Angelis, Andreaus, Figs. 2 to 12."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
-from table_io.block import Block
 from table_io.units import GRAVITY_M_S2
 from twin.drawing.branch_curves import (
     FREE_QUANTITIES,
@@ -256,7 +256,7 @@ def _draw_errors(run: ReportData) -> CaptionedFigures:
 
 def _draw_overview(run: ReportData) -> CaptionedFigures:
     """Draw envelopes of table and mass motion over the whole run, with the steps shaded."""
-    blocks, rows = compute_envelopes(run)
+    rows, spans = compute_envelopes(run), run.list_step_spans()
     if not rows:
         return
     figure = PanelFigure((FIGURE_WIDTH_IN, 1.7 * len(rows) + 0.4), len(rows))
@@ -266,14 +266,14 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
         for time, low, high in envelopes:
             ax.fill_between(time, low, high, color="#8b929c", lw=0)
         ax.set_ylabel(label)
-        _shade_steps(run, ax, blocks, ax is axes[0])
+        _shade_steps(run, ax, spans, ax is axes[0])
         if label.startswith("$u$") and run.gaps_m is not None:
             draw_rest_lines(run.gaps_m, ax.axhline)
         for peak in peaks if label == "table in m/s²" else ():
             ax.axhline(peak, color="#111111", ls="--", lw=0.9)
             ax.axhline(-peak, color="#111111", ls="--", lw=0.9)
     axes[-1].set_xlabel("time in s")
-    axes[-1].set_xlim(blocks[0].time_s[0], blocks[-1].time_s[-1])
+    axes[-1].set_xlim(spans[0][1], spans[-1][2])
     caption = (
         "Envelopes. Shading: steps, red forward, blue backward, with their frequencies in Hz on "
         "top. Dashed: demanded peak acceleration and positions of the bumpers at rest."
@@ -282,29 +282,29 @@ def _draw_overview(run: ReportData) -> CaptionedFigures:
 
 
 def _shade_steps(
-    run: ReportData, ax: FigurePanel, blocks: tuple[Block, ...], show_labels: bool
+    run: ReportData,
+    ax: FigurePanel,
+    spans: Sequence[tuple[int, float, float]],
+    show_labels: bool,
 ) -> None:
     steps_by_index = {step.index: step for step in (*run.steps, *run.summary.visits)}
-    duration_s = blocks[-1].time_s[-1] - blocks[0].time_s[0]
+    duration_s = spans[-1][2] - spans[0][1]
     next_label_s = 0.0
-    for block in blocks:
-        time_s, cuts = block.time_s, np.flatnonzero(np.diff(block.step)) + 1
-        for first, last in zip([0, *cuts], [*cuts, len(block)], strict=True):
-            step = steps_by_index.get(int(block.step[first]))
-            if step is None:
-                continue
-            start, stop = time_s[first], time_s[last - 1]
-            shade = 0.20 if step.index % 2 else 0.09
-            ax.axvspan(
-                start, stop, color=DIRECTION_COLOURS[step.direction], alpha=shade, lw=0, zorder=0
-            )
-            if show_labels and start >= next_label_s:
-                middle = (start + stop) / 2
-                ax.annotate(
-                    f"{step.frequency_hz:g}", (middle, 1.02), xycoords=("data", "axes fraction"),
-                    ha="center", size=8, color=GUIDE_COLOUR,
-                )  # fmt: skip
-                next_label_s = start + duration_s / 22
+    for number, start, stop in spans:
+        step = steps_by_index.get(number)
+        if step is None:
+            continue
+        shade = 0.20 if step.index % 2 else 0.09
+        ax.axvspan(
+            start, stop, color=DIRECTION_COLOURS[step.direction], alpha=shade, lw=0, zorder=0
+        )
+        if show_labels and start >= next_label_s:
+            middle = (start + stop) / 2
+            ax.annotate(
+                f"{step.frequency_hz:g}", (middle, 1.02), xycoords=("data", "axes fraction"),
+                ha="center", size=8, color=GUIDE_COLOUR,
+            )  # fmt: skip
+            next_label_s = start + duration_s / 22
 
 
 def _draw_level(run: ReportData) -> CaptionedFigures:

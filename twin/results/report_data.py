@@ -7,6 +7,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from pydantic import ValidationError
@@ -14,10 +16,11 @@ from pydantic import ValidationError
 from table_io.block import Block, Float1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS, contact_forces, relative_displacement
 from table_io.config.profile import ComparisonConfig, Specimen
-from table_io.records import Comparison, Params, PrcPoint
+from table_io.records import Params, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.model.config import ModelConfig
 from twin.model.model import Model
+from twin.recording.columns import PIECE_SAMPLES, ComparisonTable
 from twin.recording.reader import Recording
 from twin.results.contracts import OrbitResult, RunSummary, StepEntry, WindowResult
 from twin.results.players import SystemMotion
@@ -39,6 +42,29 @@ COMPARED_CHANNELS: dict[str, tuple[str, ...]] = {
 MAX_INTERVALS, SLOPE_WINDOW_S, MAX_ENVELOPE_BINS = 2, 0.020, 1600
 
 
+class Stretch(NamedTuple):
+    """Samples first .. end - 1 of a stream, which have the same step and label and no gap."""
+
+    step: int
+    label: int
+    first: int
+    end: int
+
+
+def list_stretches(recording: Recording, stream: str) -> list[Stretch]:
+    """Return the stretches of a stream in order."""
+    stretches: list[Stretch] = []
+    for block in recording.iter_pieces(stream):
+        changes = np.flatnonzero(np.diff(block.step) | np.diff(block.label)) + 1
+        for first, end in pairwise([0, *changes.tolist(), len(block)]):
+            state = int(block.step[first]), int(block.label[first])
+            begin = block.index + first
+            if stretches and (*stretches[-1][:2], stretches[-1].end) == (*state, begin):
+                begin = stretches.pop().first
+            stretches.append(Stretch(*state, begin, block.index + end))
+    return stretches
+
+
 @dataclass(frozen=True)
 class ReportData:
     """Recording and summary of a run, with the specimen that every figure needs."""
@@ -53,11 +79,40 @@ class ReportData:
         """Measured stream, joined between gaps; of a simulation the motion of the table."""
         return self.recording.contiguous_blocks("meas")
 
+    @property
+    def shown_stream(self) -> str:
+        """Stream of an overview: "meas", or "pred" if nothing was measured."""
+        has_twin = self.source == "twin" and self.recording.contiguous_blocks("pred")
+        return "pred" if has_twin else "meas"
+
+    @property
+    def shown_blocks(self) -> tuple[Block, ...]:
+        """Stream of an overview, joined between gaps."""
+        return self.recording.contiguous_blocks(self.shown_stream)
+
     def read_stream(self, stream: str, first: int, end: int) -> list[Block]:
         """Return samples first .. end - 1 of "meas" or "pred"; unrecorded ones are recomputed."""
         if stream == "meas":
             return cut_blocks(self.measured_blocks, first, end)
         return cut_blocks(self._predictions.read(first, end), first, end)
+
+    @cached_property
+    def measured_stretches(self) -> list[Stretch]:
+        """Stretches of the measured stream, in order."""
+        return list_stretches(self.recording, "meas")
+
+    def list_step_spans(self) -> list[tuple[int, float, float]]:
+        """Return (step, first and last time in s) of the stretches of a step that is shown."""
+        is_measured = self.shown_stream == "meas"
+        stretches = (
+            self.measured_stretches if is_measured else list_stretches(self.recording, "pred")
+        )
+        spans: list[tuple[int, int, int]] = []
+        for step, _, first, end in stretches:
+            is_next = spans and spans[-1][::2] == (step, first)
+            spans.append((step, spans.pop()[1] if is_next else first, end))
+        rate_hz = self.recording.start.rate_hz
+        return [(step, first / rate_hz, (end - 1) / rate_hz) for step, first, end in spans]
 
     @cached_property
     def _predictions(self) -> Predictions:
@@ -218,12 +273,10 @@ def select_frequencies(run: ReportData) -> dict[float, str]:
 def extract_step_motion(run: ReportData, stream: str, step: int) -> StepMotion | None:
     """Return the measured cycles of a step from "meas", or the free-running twin from "pred"."""
     blocks: list[Block] = []
+    measured = [each for each in run.measured_stretches if each[:2] == (step, Label.MEASURE)]
     for block in run.measured_blocks:
-        indices = (
-            np.flatnonzero((block.step == step) & (block.label == Label.MEASURE)) + block.index
-        )
-        if indices.size:
-            blocks += run.read_stream(stream, int(indices[0]), int(indices[-1]) + 1)
+        if inside := [each for each in measured if block.index <= each.first < block.end]:
+            blocks += run.read_stream(stream, inside[0].first, inside[-1].end)
     if not blocks:
         return None
     first, size = blocks[0].index, blocks[-1].end - blocks[0].index
@@ -280,41 +333,44 @@ def pair_motions(
     return pairs
 
 
-def compute_envelopes(run: ReportData) -> tuple[tuple[Block, ...], dict[str, list[Envelope]]]:
-    """Return (blocks of the run, envelopes by row of the overview), without rows of no data."""
-    name, prefix = ("meas", "") if run.source == "measured" else ("pred", "free/")
-    blocks = run.recording.contiguous_blocks(name) or run.measured_blocks
+def compute_envelopes(run: ReportData) -> dict[str, list[Envelope]]:
+    """Return the envelopes of the shown blocks by row of the overview, without rows of no data."""
+    prefix = "" if run.source == "measured" else "free/"
 
     def get_channel(block: Block, channel: str) -> Float1D:
         missing = np.full(len(block), np.nan)
         return block.channel(prefix + channel) if prefix + channel in block.channels else missing
 
-    rows = {
+    rows: dict[str, Callable[[Block], Float1D]] = {
         "table in mm": lambda block: get_channel(block, "table_disp_m") * 1e3,
         "table in m/s²": lambda block: get_channel(block, "table_acc_m_s2"),
         "$u$ in mm": lambda block: (
             (get_channel(block, "rel_disp_m") if prefix else relative_displacement(block)) * 1e3
         ),
     }
+    envelopes: dict[str, list[Envelope]] = {label: [] for label in rows}
     low_hz = min((step.frequency_hz for step in run.steps), default=1.0)
-    envelopes = {
-        label: [_compute_envelope(block, get_values, low_hz) for block in blocks]
-        for label, get_values in rows.items()
-    }
-    return blocks, {
+    for block in run.shown_blocks:
+        # Bins of at least one cycle, as many in each piece as it holds.
+        width = max(len(block) // MAX_ENVELOPE_BINS, round(block.rate_hz / low_hz), 1)
+        samples = width * max(PIECE_SAMPLES // width, 1)
+        pieces = [
+            [_compute_envelope(piece, get_values(piece), width) for get_values in rows.values()]
+            for piece in run.recording.cut_block(block, samples)
+        ]
+        for label, parts in zip(rows, zip(*pieces, strict=True), strict=True):
+            time_s, low, high = map(np.concatenate, zip(*parts, strict=True))
+            envelopes[label].append((time_s, low, high))
+    return {
         label: row_envelopes
         for label, row_envelopes in envelopes.items()
         if any(np.isfinite(low).any() for _, low, _ in row_envelopes)
     }
 
 
-def _compute_envelope(
-    block: Block, get_values: Callable[[Block], Float1D], low_hz: float
-) -> Envelope:
-    """Return (time in s, minimum, maximum) of bins of at least one cycle; NaN without samples."""
-    width = max(len(block) // MAX_ENVELOPE_BINS, round(block.rate_hz / low_hz), 1)
+def _compute_envelope(block: Block, values: Float1D, width: int) -> Envelope:
+    """Return (time in s, minimum, maximum) of bins of `width` samples; NaN without samples."""
     starts = np.arange(0, len(block), width)
-    values = get_values(block)
     middle_s = block.time_s[np.minimum(starts + width // 2, len(block) - 1)]
     return middle_s, np.fmin.reduceat(values, starts), np.fmax.reduceat(values, starts)
 
@@ -325,25 +381,16 @@ def compute_step_errors(run: ReportData) -> dict[str, dict[int, tuple[float, flo
     Only blocks entirely within measured cycles count. Contact forces without contact are NaN:
     they are noise.
     """
-    records = run.recording.records(Comparison)
-    sample_steps = np.full(max((block.end for block in run.measured_blocks), default=0), -1)
-    for block in run.measured_blocks:
-        sample_steps[block.index : block.end] = np.where(
-            block.label == Label.MEASURE, block.step, -1
-        )
-    comparisons_by_step: dict[int, list[Comparison]] = {}
-    for comparison in (
-        comparison
-        for comparison in records
-        if comparison.index + comparison.count <= sample_steps.size
-    ):
-        step = int(sample_steps[comparison.index])
-        if step >= 0 and step == sample_steps[comparison.index + comparison.count - 1]:
-            comparisons_by_step.setdefault(step, []).append(comparison)
+    compared = run.recording.comparisons
+    steps = np.full(len(compared), -1)
+    for step, label, first, end in run.measured_stretches:
+        if step >= 0 and label == Label.MEASURE:
+            steps[(compared.index >= first) & (compared.index + compared.count <= end)] = step
     errors: dict[str, dict[int, tuple[float, float]]] = {part: {} for part in COMPARED_CHANNELS}
-    for step, comparisons in comparisons_by_step.items():
+    for step in dict.fromkeys(steps[steps >= 0].tolist()):
+        comparisons = compared.select(steps == step)
         for part, names in COMPARED_CHANNELS.items():
-            columns = [k for k, name in enumerate(comparisons[0].channels) if name in names]
+            columns = [k for k, name in enumerate(compared.channels) if name in names]
             floor = run.contact_n / 2 if part.startswith("F") else 0.0
             if columns:
                 errors[part][step] = _compute_nrmse(comparisons, columns, floor)
@@ -351,17 +398,14 @@ def compute_step_errors(run: ReportData) -> dict[str, dict[int, tuple[float, flo
 
 
 def _compute_nrmse(
-    comparisons: list[Comparison], columns: list[int], floor: float
+    comparisons: ComparisonTable, columns: list[int], floor: float
 ) -> tuple[float, float]:
     """Return the NRMSE of the (free, restarted) twin; NaN if the signal is below `floor` RMS."""
-    measured = np.array([comparison.measured_ss for comparison in comparisons])[:, columns]
-    samples = sum(comparison.count for comparison in comparisons)
+    measured = comparisons.measured_ss[:, columns]
+    samples = int(comparisons.count.sum())
     values = []
-    for sums in (
-        [comparison.free_error_ss for comparison in comparisons],
-        [comparison.window_error_ss for comparison in comparisons],
-    ):
-        error = np.array(sums)[:, columns]
+    for sums in (comparisons.free_error_ss, comparisons.window_error_ss):
+        error = sums[:, columns]
         is_valid = np.isfinite(error) & np.isfinite(measured)
         signal_ss = float(measured[is_valid].sum())
         exceeds_floor = signal_ss > samples * floor**2

@@ -7,6 +7,8 @@ from functools import cached_property
 from itertools import pairwise, zip_longest
 from pathlib import Path
 
+import numpy as np
+
 from table_io.block import Block
 from table_io.errors import InputError
 from table_io.records import (
@@ -28,13 +30,15 @@ from twin.compare import pipeline
 from twin.compare.pipeline import EVENT_KINDS
 from twin.compare.prediction_hash import hash_cells
 from twin.compare.twins import TwinSetup, advance_twins, resume_twins
-from twin.recording.columns import BlockStore, StoredBlock, StoredItem, StoredItems
+from twin.recording.columns import SeriesStore, StoredItems
 from twin.recording.mcap_log import write_items
-from twin.recording.reader import TOPIC_ORDER, Recording, find_topic, read_start
+from twin.recording.reader import Recording, read_start
 from twin.results.recordings import open_recording, read_recorded_config
 from twin.setup.run_config import RunConfig
 from twin.system.terminal import error_console
 from twin.transport.codec import Item
+from twin.transport.endpoint import PRED_TOPIC
+from twin.transport.series import split_item
 
 DRIVE_CHANNEL = "table_acc_m_s2"  # of the twin
 BLOCK_DURATION_S = 1.0  # offline; results do not depend on the block size
@@ -98,7 +102,7 @@ def _iter_source(recording: Recording, block_samples: int, edges: list[int]) -> 
             for first, last in pairwise(sorted({block.index, *boundaries, *inside, block.end})):
                 yield block.cut(first, last)
 
-    records: Iterable[Item] = [item for item in recording.items if is_rig_item(item)]
+    records: Iterable[Item] = filter(is_rig_item, recording.items.records)
     yield from heapq.merge(iter_blocks(), records, key=lambda item: item.index)
 
 
@@ -194,12 +198,11 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
         _warn(recording, f"only a part is recorded, and the rest cannot be recomputed: {error}")
         return recording
     sample_count = sum(map(len, recording.contiguous_blocks("meas")))
-    store = BlockStore(lambda _: sample_count)
-    blocks: list[StoredItem] = []
+    store = SeriesStore(lambda _: sample_count)
     hashes: dict[int, PredictionHash] = {}
     for item in rerun_twin(recording, config):
         if isinstance(item, Block) and item.stream == "pred":
-            blocks.append(store.add(item))
+            store.add(item, np.array([item.index]), *split_item(item))
         elif isinstance(item, PredictionHash):
             hashes[item.index] = item
     recorded = recording.records(PredictionHash)
@@ -207,15 +210,9 @@ def restore_predictions(recording: Recording, config: RunConfig | None = None) -
     if differing:
         _warn(recording, f"{differing} of {len(recorded)} hashes differ from those of the run")
     start = replace(recording.start, predictions_every=0)
-    others = [
-        start if isinstance(entry, RunStart) else entry
-        for entry in recording.items.entries
-        if not (isinstance(entry, StoredBlock) and entry.stream == "pred")
-    ]
-    entries = sorted(
-        [*others, *blocks], key=lambda entry: (entry.index, TOPIC_ORDER[find_topic(entry)])
-    )
-    return replace(recording, start=start, items=StoredItems(entries))
+    records = [start if isinstance(each, RunStart) else each for each in recording.items.records]
+    items = StoredItems(records, {**recording.items.series, PRED_TOPIC: store.close()})
+    return replace(recording, start=start, items=items)
 
 
 def _warn(recording: Recording, problem: str) -> None:

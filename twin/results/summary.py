@@ -16,7 +16,6 @@ from table_io.config.channel import read_channels
 from table_io.config.profile import Profile
 from table_io.records import (
     Check,
-    Comparison,
     Estimate,
     Event,
     Fault,
@@ -36,6 +35,7 @@ from twin.compare.monitoring.cycle import ChannelNoise
 from twin.compare.pipeline import EVENT_KINDS
 from twin.model.model import Model
 from twin.model.parameters import Parameters, free_flight_resonance
+from twin.recording.columns import ComparisonTable
 from twin.recording.reader import Recording
 from twin.results.best_linear import estimate_best_linear, format_best_linear
 from twin.results.contracts import (
@@ -99,11 +99,10 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
     demanded: dict[int, Step | StepAdded] = {step.index: step for step in start.steps}
     demanded |= {addition.step: addition for addition in recording.records(StepAdded)}
     measured_cycles = profile.sweep.measured_cycles if start.steps and points else 0
-    free_errors = sum_free_errors(
-        () if "free" in failed else recording.records(Comparison),
-        points,
-        {index: measured_cycles / step.frequency_hz for index, step in demanded.items()},
-        start.rate_hz,
+    comparisons = recording.comparisons
+    durations = {index: measured_cycles / step.frequency_hz for index, step in demanded.items()}
+    free_errors = (
+        {} if "free" in failed else sum_free_errors(comparisons, points, durations, start.rate_hz)
     )
 
     def describe_step(point: PrcPoint) -> StepEntry:
@@ -155,9 +154,7 @@ def summarise(recording: Recording, parameters: Parameters) -> RunSummary:
         twin_jumps=make_jumps(twin_jumps),
         twin_hysteresis=make_intervals(twin_intervals),
         timing=summarise_timing(recording.records(Timing)),
-        comparison=channel_nrmse(
-            recording.records(Comparison), parameters, channels, noise, failed
-        ),
+        comparison=channel_nrmse(comparisons, parameters, channels, noise, failed),
         estimates=_list_estimates(recording.records(Estimate)),
         warnings=_list_events(recording, WARNING_KINDS, clipped),
         alarms=_list_events(recording, ALARM_KINDS, clipped),
@@ -193,7 +190,8 @@ def _describe_run(
 ) -> RunInfo:
     """Return what was run, where and when."""
     start, stop = recording.start, recording.stop
-    end = stop.index if stop else max((block.end for block in recording.blocks("meas")), default=0)
+    blocks = recording.contiguous_blocks("meas")
+    end = stop.index if stop else max((block.end for block in blocks), default=0)
     samples = max(end - start.index, 0)
     return RunInfo(
         id=start.run,
@@ -279,7 +277,7 @@ def _collect_points(
         setup = pipeline.prepare_pipeline(profile, Model(parameters), recording.start.steps)
         setup = pipeline.add_steps(setup, *recording.records(StepAdded))
         state, _ = pipeline.start_pipeline(setup)
-        for block in recording.contiguous_blocks("meas"):
+        for block in recording.iter_pieces("meas"):
             state, items = pipeline.step(setup, state, block)
             for item in items:
                 if isinstance(item, PrcPoint):
@@ -357,7 +355,7 @@ def summarise_timing(records: tuple[Timing, ...]) -> TimingResult:
 def find_channel_noise(recording: Recording) -> ChannelNoise:
     """Return the noise of the channels of a recording, from its first samples at rest."""
     noise = ChannelNoise()
-    for block in recording.blocks("meas"):
+    for block in recording.iter_pieces("meas"):
         if noise.is_known:
             break
         noise = noise.add_block(block)
@@ -365,7 +363,7 @@ def find_channel_noise(recording: Recording) -> ChannelNoise:
 
 
 def channel_nrmse(
-    comparisons: tuple[Comparison, ...],
+    comparisons: ComparisonTable,
     parameters: Parameters,
     channels: Mapping[str, Channel],
     noise: ChannelNoise,
@@ -388,32 +386,29 @@ def channel_nrmse(
     }
     extra = (channel.name for channel in select_predicted(channels.values()))
     names = (*COMPARED_CHANNELS, *(name for name in extra if name not in CHANNEL_BY_NAME))
-    comparisons = tuple(comparison for comparison in comparisons if comparison.channels == names)
-    if not comparisons:
+    if comparisons.channels != names:
         return {}
-    measured, free, window = (
-        np.array([getattr(comparison, name) for comparison in comparisons])
-        for name in ("measured_ss", "free_error_ss", "window_error_ss")
-    )
-    measured[:, names.index("mass_disp_m")] = measured[:, names.index("rel_disp_m")]
-    counts = np.array([comparison.count for comparison in comparisons])
     errors = {}
     for column, name in enumerate(names):
-        is_known = np.isfinite(measured[:, column])
-        total = measured[is_known, column].sum()
+        # The motion of the table is measured and no prediction.
+        moving = "rel_disp_m" if name == "mass_disp_m" else name
+        measured = comparisons.measured_ss[:, names.index(moving)]
+        is_known = np.isfinite(measured)
+        total = measured[is_known].sum()
         rms = _compared_noise(noise, name)
         is_comparable = name not in absent
         errors[name] = ChannelError(
-            nrmse=_compute_nrmse(window[:, column], measured[:, column])
+            nrmse=_compute_nrmse(comparisons.window_error_ss[:, column], measured)
             if is_comparable and "window" not in failed
             else None,
-            free_nrmse=_compute_nrmse(free[:, column], measured[:, column])
+            free_nrmse=_compute_nrmse(comparisons.free_error_ss[:, column], measured)
             if is_comparable and "free" not in failed
             else None,
-            noise_floor=rms * math.sqrt(counts[is_known].sum() / total)
+            noise_floor=rms * math.sqrt(comparisons.count[is_known].sum() / total)
             if total > 0 and is_comparable
             else None,
         )
+        comparisons.release()
     return errors
 
 

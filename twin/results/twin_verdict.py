@@ -35,7 +35,7 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement, Comparison, Event, PrcPoint
+from table_io.records import Agreement, Event, PrcPoint
 from twin.compare.curves import MIN_JUMP_RATIO
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
@@ -48,6 +48,7 @@ from twin.compare.monitoring.cycle import ChannelNoise
 from twin.compare.monitoring.jumps import JUMP_TOLERANCE, measure_separation
 from twin.compare.pipeline import FAILURE_KIND, TWIN_TITLES
 from twin.model.parameters import Parameters
+from twin.recording.columns import ComparisonTable
 from twin.recording.reader import Recording
 from twin.results.contracts import (
     NOTHING_MEASURED,
@@ -156,7 +157,7 @@ def _measure_motion(
     """
     counts: dict[int, Float1D] = {}
     ranges: dict[int, dict[int, tuple[float, float]]] = {}
-    for block in recording.contiguous_blocks("meas"):
+    for block in recording.iter_pieces("meas"):
         contact = detect_contact(block, profile.comparison.contact_n, profile.specimen.gaps_m)
         _add_cycles(counts, ranges, block, contact)
     return {
@@ -246,7 +247,7 @@ def compare_branches(
 
 
 def sum_free_errors(
-    comparisons: Sequence[Comparison],
+    comparisons: ComparisonTable,
     points: Iterable[PrcPoint],
     measured_s: Mapping[int, float],
     rate_hz: float,
@@ -255,12 +256,12 @@ def sum_free_errors(
 
     Over the measured cycles, which last `measured_s` and end where the point of the step was made.
     """
-    known = [each for each in comparisons if JUDGED_CHANNELS[0] in each.channels]
-    if not known:
+    if JUDGED_CHANNELS[0] not in comparisons.channels:
         return {}
-    column = known[0].channels.index(JUDGED_CHANNELS[0])
-    ends = np.array([each.index + each.count for each in known])
-    squares = np.array([(each.free_error_ss[column], each.measured_ss[column]) for each in known])
+    column = comparisons.channels.index(JUDGED_CHANNELS[0])
+    ends = comparisons.index + comparisons.count
+    sums = comparisons.free_error_ss, comparisons.measured_ss
+    squares = np.stack([part[:, column] for part in sums], axis=1)
     squares[~np.isfinite(squares).all(axis=1)] = 0.0  # lost samples, or before the start
     error, motion = np.vstack([np.zeros(2), np.cumsum(squares, axis=0)]).T
     ratios = {}

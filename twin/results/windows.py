@@ -6,13 +6,13 @@ import numpy as np
 
 from table_io.block import Block, Float1D
 from table_io.channels import contact_forces, relative_displacement
-from table_io.records import Comparison
 from twin.compare.cycles import detect_onsets
+from twin.recording.columns import ComparisonTable
 from twin.recording.reader import Recording
 from twin.results.contracts import ChannelError, MotionResult, PeakAndRms, WindowResult
 from twin.results.rerun import restore_predictions
 
-CompareChannels = Callable[[tuple[Comparison, ...]], dict[str, ChannelError]]
+CompareChannels = Callable[[ComparisonTable], dict[str, ChannelError]]
 
 
 def summarise_windows(
@@ -21,15 +21,12 @@ def summarise_windows(
     """Return the results of each window that was played, SI; "twin" is the free-running one."""
     recording = restore_predictions(recording)
     measured, predicted = (recording.contiguous_blocks(name) for name in ("meas", "pred"))
-    comparisons = recording.records(Comparison)
+    comparisons = recording.comparisons
+    ends = comparisons.index + comparisons.count
     rate_hz = recording.start.rate_hz
     windows = []
     for number, (first, end) in find_windows(measured).items():
-        inside = tuple(
-            comparison
-            for comparison in comparisons
-            if first <= comparison.index and comparison.index + comparison.count <= end
-        )
+        inside = comparisons.select((first <= comparisons.index) & (ends <= end))
         blocks = cut_blocks(measured, first, end)
         twin_blocks = [extract_free_twin(block) for block in cut_blocks(predicted, first, end)]
         is_measured = recording.start.source == "table"

@@ -6,13 +6,13 @@ languages generate their classes from it. Only this package imports protobuf.
 
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import fields, is_dataclass, replace
 from functools import cache, lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from google.protobuf.descriptor_pb2 import (
 from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
-from table_io.block import Block, Float2D
+from table_io.block import Block, Float2D, Int1D, Int2D
 from table_io.records import (
     Agreement,
     Check,
@@ -55,6 +55,7 @@ from table_io.records import (
 )
 from twin.transport import shaketwin_pb2 as pb
 from twin.transport.endpoint import BLOCK_TOPICS, CMP_TOPIC, HASH_TOPIC
+from twin.transport.series import SeriesItem, split_item
 
 Item = Block | Record
 
@@ -143,47 +144,105 @@ def _locate_sums(comparison: Comparison, run: str, length: int) -> list[slice]:
     return [slice(end - size - k * step, end - k * step) for k in (2, 1, 0)]
 
 
-def decode_comparisons(payloads: Sequence[bytes]) -> list[tuple[str, Comparison] | None]:
-    """Decode comparisons as `decode_item` does, at once; None for those that it must decode.
+class DecodedSeries(NamedTuple):
+    """Items like `head`, at other samples and with other numbers, by the places of their payloads.
 
-    Those of a run differ in index and sums, which lie at the same places in payloads of one length.
+    `values` and `integers` are the columns of one item after the other, see `split_item`.
     """
-    decoded: list[tuple[str, Comparison] | None] = [None] * len(payloads)
-    by_length: dict[int, list[int]] = {}
-    for place, payload in enumerate(payloads):
-        by_length.setdefault(len(payload), []).append(place)
-    for length, places in by_length.items():
-        try:
-            run, first = decode_item(CMP_TOPIC, payloads[places[0]])
-        except WireError:
-            continue
-        if not isinstance(first, Comparison) or encode_item(first, run) != payloads[places[0]]:
-            continue
-        sums = first.measured_ss, first.free_error_ss, first.window_error_ss
-        if {*map(len, sums)} != {len(first.channels)}:
-            continue
-        rows = np.frombuffer(b"".join(payloads[place] for place in places), np.uint8)
-        rows = rows.reshape(-1, length)
-        digits = len(pb.Comparison(index=first.index).SerializeToString())  # with the tag
-        is_free = np.zeros(length, dtype=bool)
-        is_free[1:digits] = True
-        columns = []
-        for span in _locate_sums(first, run, length):
-            is_free[span] = True
-            columns.append(np.ascontiguousarray(rows[:, span]).view("<f8").tolist())
-        is_alike = (rows[:, ~is_free] == rows[0, ~is_free]).all(axis=1)
-        varint = rows[:, 1:digits]
-        is_alike &= ((varint & 0x80) == (varint[0] & 0x80)).all(axis=1)
-        weights = 1 << 7 * np.arange(varint.shape[1])
-        indices = ((varint & 0x7F) * weights).sum(axis=1, dtype=np.int64)
-        is_alike &= indices <= MAX_SAMPLE_INDEX
-        for place, alike, index, measured, free, window in zip(
-            places, is_alike.tolist(), indices.tolist(), *columns, strict=True
-        ):
-            if alike:
-                sums = tuple(measured), tuple(free), tuple(window)
-                decoded[place] = run, Comparison(index, first.count, first.channels, *sums)
-    return decoded
+
+    places: Int1D
+    run: str
+    head: SeriesItem
+    indices: Int1D
+    values: Float2D
+    integers: Int2D
+
+
+def decode_series(
+    topic_name: str, payloads: Sequence[bytes], errors: list[str]
+) -> Iterator[DecodedSeries]:
+    """Yield blocks or comparisons decoded; why one is not decoded is appended to `errors`.
+
+    Those of a run differ in index and numbers, which lie at the same places in payloads of one
+    length: as many as follow each other are decoded at once, and any other one by one.
+    """
+    for _, group in groupby(range(len(payloads)), lambda place: len(payloads[place])):
+        places = list(group)
+        series = _decode_alike(topic_name, payloads, places) if len(places) > 1 else None
+        if series is not None:
+            yield series
+        done = () if series is None else series.places.tolist()
+        for place in sorted({*places}.difference(done)):
+            try:
+                run, item = decode_item(topic_name, payloads[place])
+                columns = split_item(cast(SeriesItem, item))
+            except WireError as error:
+                errors.append(str(error))
+            except ValueError as error:
+                errors.append(f"{topic_name}: {error}")
+            else:
+                head = cast(SeriesItem, item)
+                yield DecodedSeries(np.array([place]), run, head, np.array([item.index]), *columns)
+
+
+def _decode_alike(
+    topic_name: str, payloads: Sequence[bytes], places: list[int]
+) -> DecodedSeries | None:
+    """Decode those of the payloads, of one length, that are like the first; None if it is unusual.
+
+    It is if it does not decode, or is not encoded as `encode_item` does.
+    """
+    example = payloads[places[0]]
+    try:
+        run, item = decode_item(topic_name, example)
+        head = cast(SeriesItem, item)
+        shape = split_item(head)[0].shape
+    except ValueError:
+        return None
+    if encode_item(head, run) != example:
+        return None
+    rows = np.frombuffer(b"".join(payloads[place] for place in places), np.uint8)
+    rows = rows.reshape(len(places), -1)
+    digits, *spans = _locate_numbers(head, run, len(example))
+    is_free = np.zeros(len(example), dtype=bool)
+    for span in (digits, *spans):
+        is_free[span] = True
+    varint = rows[:, digits]
+    is_alike = (rows[:, ~is_free] == rows[0, ~is_free]).all(axis=1)
+    is_alike &= ((varint & 0x80) == (varint[0] & 0x80)).all(axis=1)
+    index = ((varint & 0x7F) * (1 << 7 * np.arange(varint.shape[1]))).sum(axis=1, dtype=np.int64)
+    is_alike &= index + shape[1] <= MAX_SAMPLE_INDEX
+    if not is_alike.all():
+        rows, index = rows[is_alike], index[is_alike]
+    numbers = [np.ascontiguousarray(rows[:, span]) for span in spans]
+    if isinstance(head, Block):
+        columns = [
+            part.view(kind)
+            .reshape(len(rows), height, shape[1])
+            .transpose(1, 0, 2)
+            .reshape(height, len(rows) * shape[1])
+            for part, kind, height in zip(numbers, ("<f8", "<i4"), (shape[0], 3), strict=True)
+        ]
+        values, integers = columns[0], columns[1].astype(np.int64)
+    else:
+        values = np.hstack([part.view("<f8") for part in numbers]).T
+        integers = np.zeros((3, len(rows)), np.int64)
+        integers[0] = head.count
+    return DecodedSeries(np.array(places)[is_alike], run, head, index, values, integers)
+
+
+def _locate_numbers(head: SeriesItem, run: str, length: int) -> list[slice]:
+    """Return the places of the digits of the index, and of the numbers, in a payload."""
+    kind = type(head)
+    message = getattr(pb, MESSAGE_NAMES[kind])
+    digits = len(message(index=head.index).SerializeToString())
+    if isinstance(head, Comparison):
+        return [slice(1, digits), *_locate_sums(head, run, length)]
+    begin = len(message(run=run, stream=head.stream).SerializeToString())
+    labels = length - 12 * len(head)
+    end = length - len(message(labels=bytes(12 * len(head))).SerializeToString())
+    values = slice(end - head.values.nbytes, end)
+    return [slice(begin + 1, begin + digits), values, slice(labels, length)]
 
 
 def strip_run(payload: bytes, kind: type, run: str) -> bytes:

@@ -280,6 +280,7 @@ def write_rrd(recording: Recording, out: Path) -> None:
     view = RerunView(recording.start, save=out)
     for first in range(0, len(recording.items), BATCH_ITEMS):
         view.feed(recording.items[first : first + BATCH_ITEMS])
+        recording.items.release()
     view.close()
 
 
