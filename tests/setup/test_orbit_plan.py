@@ -53,7 +53,7 @@ def test_plan_goes_through_both_folds(plan):
 
 
 @pytest.mark.parametrize("start_hz", [2.85, 3.4, 3.9])
-def test_range_that_begins_between_the_folds_is_reached_from_below_the_lower_one(start_hz):
+def test_range_that_begins_between_the_folds_is_reached_through_the_lower_one(start_hz):
     plan = make_orbit_plan(Model(snm()), (start_hz, 4.1), AG, 8, FEEDBACK_TIMING)
     stable = [point.stable for point in plan.points]
     assert stable[0]
@@ -62,6 +62,19 @@ def test_range_that_begins_between_the_folds_is_reached_from_below_the_lower_one
     assert unstable_hz == sorted(unstable_hz)
     assert unstable_hz[0] < 2.83
     assert sum(f >= start_hz for f in unstable_hz) >= 7
+
+
+@pytest.mark.parametrize("range_hz", [(2.75, 2.9), RANGE_HZ])
+def test_stable_orbits_lead_to_the_first_one_from_above_both_folds(range_hz):
+    """Between the folds rest may lead to the large motion; above both there is none."""
+    plan = make_orbit_plan(Model(snm()), range_hz, AG, 8, FEEDBACK_TIMING)
+    way = [*plan.leads, plan.points[0]]
+    assert all(orbit.stable for orbit in way)
+    assert way[0].frequency_hz > 4.0273
+    assert max(orbit.frequency_hz for orbit in way[1:]) < way[0].frequency_hz
+    steps = np.diff([math.log(orbit.frequency_hz) for orbit in way])
+    assert ((steps > -0.1) & (steps < 0.0)).all()
+    assert (np.diff([orbit.amplitude_m for orbit in way]) > 0.0).all()
 
 
 def test_a_range_far_below_the_upper_fold_is_planned() -> None:

@@ -8,6 +8,7 @@ which no gains hold them.
 import math
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,8 +68,8 @@ class UnstableStretch:
 
         There are more than `points` where these would be further than MAX_SPACING apart. The stable
         ones, LEAD_ORBITS on either side, are those beyond a fold that the range holds. A range that
-        begins between the folds is reached from below the lower one, where rest leads to the
-        branch: the orbits on the way are measured too.
+        begins between the folds is reached through the lower one: the orbits on the way are
+        measured too.
         """
         frequencies = np.array([orbit.frequency_hz for orbit in self.orbits])
         fine = np.linspace(0.0, 1.0, FINE_POSITIONS)
@@ -83,6 +84,15 @@ class UnstableStretch:
             way = MAX_SPACING * (np.arange(-LEAD_ORBITS, math.ceil(low / MAX_SPACING)) + 0.5)
             positions = np.append(way[way < low], positions[positions > low])
         return [float(p) for p in positions if self.positions[0] <= p <= last]
+
+    def list_leads(self, position: float) -> list[Orbit]:
+        """Return stable orbits that lead to a position from beyond all folds, if there are any."""
+        before = [
+            orbit for orbit, p in zip(self.orbits, self.positions, strict=True) if p < position
+        ]
+        unstable_hz = [orbit.frequency_hz for orbit in self.orbits if not orbit.stable]
+        leads = _select_leads(before[::-1], self.orbit_at(position), unstable_hz)
+        return leads if all(orbit.stable for orbit in leads) else []
 
     def orbit_at(self, position: float) -> Orbit:
         """Return the orbit at a position by Newton's method."""
@@ -130,6 +140,7 @@ def make_orbit_plan(
         latency_s=timing.latency_s,
         jitter_s=timing.jitter_s,
         points=tuple(_plan_orbit(orbit, own) for orbit, own in zip(orbits, gains, strict=True)),
+        leads=tuple(_plan_orbit(orbit, gains[0]) for orbit in stretch.list_leads(positions[0])),
     )
 
 
@@ -393,7 +404,7 @@ def _find_replace_after(profile: Profile, rig: RigConfig) -> int:
 RESONANCE_PHASE_DEG = 90.0  # by which u leads: more below the resonance, less above
 PHASE_TOLERANCE_DEG = 1e-3
 MAX_BISECTIONS = 40
-LEAD_RATIO = 1.04  # of the frequencies of two orbits on the way from rest to the resonance
+LEAD_RATIO = 1.04  # of the frequencies of two orbits on the way from rest to the first one
 
 
 def find_phase_resonance(period_map: PeriodMap, range_hz: tuple[float, float]) -> Orbit:
@@ -435,21 +446,24 @@ def find_resonance_approach(period_map: PeriodMap, range_hz: tuple[float, float]
     return [*_select_leads(below, resonances[k], folds_hz), resonances[k]]
 
 
-def _select_leads(below: list[Orbit], resonance: Orbit, folds_hz: list[float]) -> list[Orbit]:
-    """Return orbits by rising frequency from below all folds to the resonance, LEAD_RATIO apart.
+def _select_leads(way: list[Orbit], target: Orbit, folds_hz: Sequence[float]) -> list[Orbit]:
+    """Return orbits LEAD_RATIO apart in frequency that lead to a target from beyond all folds.
 
-    below: the branch away from the resonance, towards lower frequencies.
+    way: the branch away from the target. Beyond all folds rest leads to no other solution; if the
+    target lies there itself, there are none.
     """
-    lowest_hz = min(folds_hz, default=resonance.frequency_hz)
-    if lowest_hz >= resonance.frequency_hz:
+    if not folds_hz:
         return []
-    leads, next_hz = [], resonance.frequency_hz / LEAD_RATIO
-    for orbit in below:
-        if orbit.frequency_hz <= next_hz:
-            leads.append(orbit)
-            next_hz = orbit.frequency_hz / LEAD_RATIO
-        if orbit.frequency_hz < lowest_hz / LEAD_RATIO:
+    low_hz, high_hz = min(folds_hz) / LEAD_RATIO, max(folds_hz) * LEAD_RATIO
+    leads, last = [], target
+    for orbit in way:
+        if not low_hz < last.frequency_hz < high_hz:
             break
+        ratio = orbit.frequency_hz / last.frequency_hz
+        is_beyond = not low_hz < orbit.frequency_hz < high_hz
+        if is_beyond or not 1.0 / LEAD_RATIO < ratio < LEAD_RATIO:
+            leads.append(orbit)
+            last = orbit
     return leads[::-1]
 
 
