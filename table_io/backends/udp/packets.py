@@ -207,7 +207,7 @@ class UdpWiring(BackendConfig):
     target: str = Field(description="HOST:PORT of the target.")
     rig_port: int = Field(0, ge=0, le=65535, strict=True, description="Port of the rig; 0: any.")
     replace_after_ms: Positive = Field(
-        40.0, le=1000.0, description="From a decision to the first sample it can change."
+        30.0, le=1000.0, description="From a decision to the first sample it can change."
     )
 
     @field_validator("target")
