@@ -1,6 +1,6 @@
 """Damaged and lying files through the commands that read recordings: what comes of each.
 
-    python tests/studies/hostile_files.py COUNT [FIRST]     mutants FIRST to FIRST + COUNT - 1
+    python -m tests.studies.hostile_files COUNT [FIRST]     mutants FIRST to FIRST + COUNT - 1
 
 A process makes them and calls the commands as the command line does; another watches that it goes
 on, and goes on itself after a crash. Its memory is limited. What is not an exit code of the

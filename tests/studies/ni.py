@@ -1,11 +1,11 @@
 """Figures of the NI path, through NI's client and a server process with the simulated table.
 
-    python tests/studies/ni.py soak 10 1       ten minutes in real time
-    python tests/studies/ni.py soak 60 10      an hour, ten times as fast as the clock
-    python tests/studies/ni.py hours 1         on a clock that jumps
-    python tests/studies/ni.py decisions 250   from a decision to the first changed sample
-    python tests/studies/ni.py server          the server killed in a run
-    python tests/studies/ni.py rig             the rig killed in a run
+    python -m tests.studies.ni soak 10 1       ten minutes in real time
+    python -m tests.studies.ni soak 60 10      an hour, ten times as fast as the clock
+    python -m tests.studies.ni hours 1         on a clock that jumps
+    python -m tests.studies.ni decisions 250   from a decision to the first changed sample
+    python -m tests.studies.ni server          the server killed in a run
+    python -m tests.studies.ni rig             the rig killed in a run
 
 `ni_error_codes.py` reports every error that the driver has a code for.
 """

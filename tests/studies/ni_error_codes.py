@@ -1,6 +1,6 @@
 """Every error that NI's driver has a code for, on every call of a run: what is said, what happens.
 
-    python tests/studies/ni_error_codes.py [STEP]    every code, or every STEP-th
+    python -m tests.studies.ni_error_codes [STEP]    every code, or every STEP-th
 
 In one process, on a clock that jumps: each life drives the table, meets the error in motion, and is
 followed to its rest by the black box.

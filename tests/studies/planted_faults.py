@@ -1,8 +1,8 @@
 """How every planted fault is found, and how fast: the table of the guide, The controller.
 
-    python tests/studies/planted_faults.py            every fault, several channels, sizes, times
-    python tests/studies/planted_faults.py smallest   the smallest gain, drift and spike found
-    python tests/studies/planted_faults.py sweeps     false findings over ten whole sweeps
+    python -m tests.studies.planted_faults            every fault, several channels, sizes, times
+    python -m tests.studies.planted_faults smallest   the smallest gain, drift and spike found
+    python -m tests.studies.planted_faults sweeps     false findings over ten whole sweeps
 
 Complete controlled sessions on the simulated table, unpaced. A fault is found when the first trip,
 event or gap after it is known, on the session's clock: the block that shows it is waited for.
