@@ -169,7 +169,12 @@ def start_page_process(
     grant_page_access(host, port, credentials)  # refuses before a process starts
     command = [sys.executable, "-P", "-m", "twin.monitor.web", *request]
     process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+        command,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+        # glibc gives each thread of the bus a heap of its own, which fills up over an hour.
+        env=os.environ | {"MALLOC_ARENA_MAX": "1"},
     )
     try:
         announce_page(_read_page_url(process))
