@@ -19,7 +19,7 @@ from tests.recovery.scaled_specimens import (
     record_block,
     start_model,
 )
-from twin.discovery.discover import PreparedLog, discover_effects
+from twin.discovery.discover import PreparedLog, discover_effects, has_single_frequency
 from twin.discovery.identify import IdentificationResult, identify_parameters
 from twin.discovery.parameters import (
     BUMPER_DAMPING,
@@ -27,7 +27,6 @@ from twin.discovery.parameters import (
     DAMPING,
     STIFFNESS,
 )
-from twin.discovery.signals import has_single_frequency
 from twin.model.model import Model
 
 TWO_BUMPERS = Hidden(gap=GAP)
@@ -106,6 +105,10 @@ def test_one_frequency_is_read_from_the_drive() -> None:
     time = np.arange(block.values.shape[1]) / block.rate_hz
     noise = 0.01 * np.random.default_rng(0).standard_normal(time.size)
     sine, other = np.sin(2 * math.pi * 1.3 * time), np.sin(2 * math.pi * 2.1 * time)
-    assert has_single_frequency(with_drive(sine + noise).signals)
-    assert not has_single_frequency(with_drive(np.where(time < 16, sine, other)).signals)
-    assert not has_single_frequency(prepare(block, Hidden()).signals)
+    one, two = with_drive(sine + noise).signals, with_drive(other + noise).signals
+    assert has_single_frequency([one])
+    assert has_single_frequency([one, one])
+    assert not has_single_frequency([one, two])
+    assert not has_single_frequency([with_drive(np.where(time < 16, sine, other)).signals])
+    assert not has_single_frequency([prepare(block, Hidden()).signals])
+    assert not has_single_frequency([one, prepare(block, Hidden()).signals])

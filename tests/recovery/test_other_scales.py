@@ -79,3 +79,4 @@ def test_bumpers_whose_contacts_a_filter_hides_are_not_judged(tmp_path: Path) ->
     assert "bumper_stiffness" not in verdict.base
     assert any("the bumpers are not judged" in note for note in verdict.notes)
     assert not {"bumper_hardening", "hunt_crossley"} & {size.id for size in verdict.excludes}
+    assert "filters settle" in verdict.fell_away["bumper_hardening"]

@@ -109,11 +109,12 @@ def list_candidates(
     log_residuals: Sequence[LogResiduals], fitted: ParameterSet, without: Sequence[str] = ()
 ) -> tuple[tuple[Candidate, ...], dict[str, str]]:
     """Return (candidates not yet in the parameter set, reason for each excluded effect)."""
-    has_contact = any(residuals.shows_bumpers for residuals in log_residuals)
+    hidden = {residuals.explain_hidden_bumpers() for residuals in log_residuals}
+    reason_in_bumpers = "" if "" in hidden else max(hidden)
     channels = set.intersection(*(set(residuals.signals.channels) for residuals in log_residuals))
     candidates, excluded = [], {}
     for effect in (*EFFECTS, *load_plugins()):
-        reason = _exclusion_reason(effect, has_contact, channels)
+        reason = _exclusion_reason(effect, reason_in_bumpers, channels)
         untared = channels - set().union(*(r.signals.rest_values for r in log_residuals))
         is_offset = effect.id == "sensor_offset" and "damper_force_n" in untared
         if (effect.acts == "sensor" and not is_offset) or effect.id == "mass_error":
@@ -132,9 +133,9 @@ def list_candidates(
     return tuple(candidates), excluded
 
 
-def _exclusion_reason(effect: Effect, has_contact: bool, channels: set[str]) -> str:
-    if effect.is_in_bumpers and not has_contact:
-        return "there was no contact with a bumper"
+def _exclusion_reason(effect: Effect, in_bumpers: str, channels: set[str]) -> str:
+    if effect.is_in_bumpers and in_bumpers:
+        return in_bumpers
     missing = [name for name in effect.required_channels if name not in channels]
     if missing:
         return f"needs {', '.join(missing)}"

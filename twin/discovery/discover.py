@@ -45,7 +45,12 @@ from twin.discovery.selection import (
     mean_square,
     select_effects,
 )
-from twin.discovery.signals import LogSignals, derives_acc
+from twin.discovery.signals import (
+    SINGLE_LINE_WIDTH,
+    LogSignals,
+    derives_acc,
+    find_single_frequency,
+)
 from twin.discovery.starting_values import choose_start, solve_columns
 from twin.discovery.verdict import DiscoveryVerdict, qualify_none, widen_for_form
 from twin.evidence.selection import RoundEffort
@@ -152,10 +157,14 @@ def prepare_problem(
         if not residuals.knows_noise
     ]
     notes += [
-        f"{residuals.signals.name}: {_say_hidden(residuals)}; the bumpers are not judged"
+        f"{residuals.signals.name}: {reason}; the bumpers are not judged"
         for residuals in log_residuals
-        if residuals.contact_state.any() and not residuals.shows_bumpers
+        if (reason := residuals.explain_hidden_bumpers()) and residuals.contact_state.any()
     ]
+    if has_single_frequency([signals for signals, _ in pairs]):
+        notes.append(
+            "only one frequency: damping, lag, relaxation and hysteresis cannot be distinguished"
+        )
     log_residuals, first = add_nuisances(log_residuals, first.parameters, mapper)
     library, excluded = list_candidates(log_residuals, parameters, without)
     return PreparedProblem(
@@ -163,14 +172,10 @@ def prepare_problem(
     )
 
 
-def _say_hidden(residuals: LogResiduals) -> str:
-    """Return why no sample shows a bumper that is or may be touched."""
-    if residuals.motion().has_load_cells:
-        return "no contact lasts longer than its filters settle"
-    return (
-        "no load cell shows contact, and the motion hardly exceeds the stated gap; if the gap is "
-        "less, state it"
-    )
+def has_single_frequency(signals: Sequence[LogSignals]) -> bool:
+    """Return True if the drives of all logs together have one frequency."""
+    frequencies = np.array([find_single_frequency(each) or np.nan for each in signals])
+    return bool(frequencies.max() <= (1.0 + SINGLE_LINE_WIDTH) * frequencies.min())
 
 
 def add_nuisances(

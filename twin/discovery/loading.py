@@ -20,7 +20,6 @@ from twin.discovery.signals import (
     LogSignals,
     build_signals,
     find_unmeasured_side,
-    has_single_frequency,
     is_channel_alive,
 )
 from twin.discovery.starting_values import measure_gaps
@@ -174,9 +173,6 @@ def _list_notes(
     name = signals.name
     if recording.missing_samples:
         yield f"{name}: {recording.missing_samples} samples are missing; they are not used"
-    if has_single_frequency(signals):
-        alike = "damping, lag, relaxation and hysteresis cannot be distinguished"
-        yield f"{name}: only one frequency; {alike}"
     live = {channel for block in blocks[:1] for channel in block.channels} - dead
     if side := find_unmeasured_side(live, profile.specimen.gaps_m):
         yield (

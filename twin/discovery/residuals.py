@@ -203,6 +203,19 @@ class LogResiduals:
         right, left = m.gaps_m
         return bool((rows["damper"] & ((m.u > right) | (-m.u > left))).any())
 
+    def explain_hidden_bumpers(self) -> str:
+        """Return why no force of a bumper is in the residual; "" if one is."""
+        if self.shows_bumpers:
+            return ""
+        if not self.contact_state.any():
+            return "there was no contact with a bumper"
+        if self.motion().has_load_cells:
+            return "no contact lasts longer than its filters settle"
+        return (
+            "no load cell shows contact, and the motion hardly exceeds the stated gap; if the gap "
+            "is less, state it"
+        )
+
     @cached_property
     def row_mask(self) -> Bool2D:
         """Sample selection of each residual row, (row, sample)."""

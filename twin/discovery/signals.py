@@ -706,8 +706,8 @@ def _is_noise(signals: LogSignals, values: Float1D, density: Float1D) -> bool:
     return float(local.max(initial=0.0)) <= chi2.isf(chance, freedom) / freedom * expected
 
 
-def has_single_frequency(signals: LogSignals) -> bool:
-    """Return True if the drive has one frequency: most of its power lies about its main line.
+def find_single_frequency(signals: LogSignals) -> float | None:
+    """Return the frequency of the drive in Hz if most of its power lies about one line, else None.
 
     The drive is the motion of the table where it was measured, else that of the mass.
     """
@@ -717,11 +717,13 @@ def has_single_frequency(signals: LogSignals) -> bool:
     window = np.hanning(values.size)
     power = np.abs(np.fft.rfft((values - values.mean()) * window)) ** 2
     if not power.sum() > 0:
-        return False
+        return None
     line = np.arange(power.size)
     main = int(power[1:].argmax()) + 1
     about_main = np.abs(line - main) <= max(SINGLE_LINE_WIDTH * main, 3.0)
-    return float(power[about_main].sum() / power.sum()) > MIN_SINGLE_LINE_SHARE
+    if power[about_main].sum() <= MIN_SINGLE_LINE_SHARE * power.sum():
+        return None
+    return main * signals.grid.rate_hz / signals.grid.decimation / values.size
 
 
 def find_unmeasured_side(channels: Container[str], gaps_m: tuple[float, float]) -> str:
