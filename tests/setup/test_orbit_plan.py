@@ -197,7 +197,7 @@ def test_a_plan_for_a_faster_rig_is_refused_with_both_latencies(tmp_path, planne
     assert read_run_config(path).steps == planned_config.steps
     with raises_input_error(key="latency_s", allowed="50.0 ms") as error:
         read_run_config(path, "udp_simulated")
-    assert "65.0 ms" in str(error.value)
+    assert "55.0 ms" in str(error.value)
     with raises_input_error(key="backend", value="follow"):
         read_run_config(path, "follow_simulated")
 

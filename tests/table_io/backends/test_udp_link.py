@@ -185,9 +185,9 @@ def test_of_two_numbers_the_newer_is_less_than_half_way_round_ahead() -> None:
     [
         ('target = "', 'target = "nowhere', "udp.target"),
         ('"\nreplace', '0000"\nreplace', "udp.target"),
-        ("replace_after_ms = 40.0", "replace_after_ms = 0", "udp.replace_after_ms"),
-        ("replace_after_ms = 40.0", "rig_port = 70000", "udp.rig_port"),
-        ("replace_after_ms = 40.0", "replace_after_ms = 20.0", "udp.replace_after_ms"),
+        ("replace_after_ms = 30.0", "replace_after_ms = 0", "udp.replace_after_ms"),
+        ("replace_after_ms = 30.0", "rig_port = 70000", "udp.rig_port"),
+        ("replace_after_ms = 30.0", "replace_after_ms = 20.0", "udp.replace_after_ms"),
         ("[udp]", "[udpp]", "udp"),
         ("bits = 18", "bits = 16", ""),
     ],
