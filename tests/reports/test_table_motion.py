@@ -47,7 +47,7 @@ def write_spectrum(recording: Recording, factor: float) -> dict[str, Any]:
     assert motion is not None
     hz = 2.0 ** (np.arange(19) / 6)
     spectrum = compute_response_spectrum(motion.achieved_acc_m_s2, motion.rate_hz, hz)
-    sa_g = factor * spectrum.absolute_acceleration_m_s2 / GRAVITY_M_S2
+    sa_g = factor * spectrum / GRAVITY_M_S2
     rows = "".join(f"{f!r},{sa!r}\n" for f, sa in zip(hz.tolist(), sa_g.tolist(), strict=True))
     return {"required_spectrum": "rrs.csv", "files": {"rrs.csv": "frequency_hz,sa_g\n" + rows}}
 

@@ -169,10 +169,7 @@ def _draw_response_spectrum(drawing: MotionDrawing) -> CaptionedFigure:
     for per_octave, style in ((FINE_PER_OCTAVE, {"lw": 0.9}), (USUAL_PER_OCTAVE, {"ls": ""})):
         hz = list_octave_frequencies(low_hz, high_hz, per_octave)
         achieved, target = (
-            compute_response_spectrum(
-                record, motion.rate_hz, hz, config.damping
-            ).absolute_acceleration_m_s2
-            / GRAVITY_M_S2
+            compute_response_spectrum(record, motion.rate_hz, hz, config.damping) / GRAVITY_M_S2
             for record in (motion.achieved_acc_m_s2, motion.target_acc_m_s2)
         )
         if per_octave == FINE_PER_OCTAVE:
@@ -275,10 +272,8 @@ def _draw_shock_spectrum(run: ReportData, motion: TableMotion) -> CaptionedFigur
     for source, record in records.items():
         shock = compute_shock_spectrum(record, motion.rate_hz, hz, DEFAULT_DAMPING)
         wide = source == "measured"
-        for side, values, direction in (
-            ("positive", shock.positive_m_s2, "forward"),
-            ("negative", shock.negative_m_s2, "backward"),
-        ):
+        sides = zip(("positive", "negative"), shock, ("forward", "backward"), strict=True)
+        for side, values, direction in sides:
             style = measured_style(direction) if wide else twin_style(direction)
             axis.plot(hz, values / GRAVITY_M_S2, **style)
             keys.append(Key(f"{source}, {side}", style))

@@ -139,8 +139,7 @@ def _match_record(
     for _ in range(MATCH_ITERATIONS):
         motion = envelope * np.fft.irfft(amplitudes * np.exp(2j * math.pi * phases), count)
         motion = np.fft.irfft(np.fft.rfft(motion) * band, count)  # what the envelope spread
-        computed = compute_response_spectrum(motion, rate_hz, hz, shape.damping)
-        ratios = computed.absolute_acceleration_m_s2 / required
+        ratios = compute_response_spectrum(motion, rate_hz, hz, shape.damping) / required
         # The factor that puts the extremes at equal distances from the aim.
         factor = 1.0 / math.sqrt(ratios.min() * ratios.max())
         spread = math.log(ratios.max() / ratios.min())
@@ -149,8 +148,7 @@ def _match_record(
         amplitudes = amplitudes * np.interp(ln_f, np.log(hz), (factor * ratios) ** -CORRECTION_GAIN)
     judged = list_octave_frequencies(low_hz, high_hz, USUAL_PER_OCTAVE)
     computed = compute_response_spectrum(best, rate_hz, judged, shape.damping)
-    ratios = computed.absolute_acceleration_m_s2 / spectrum.interpolate(judged)
-    return SpectrumRecord(rate_hz, best, judged, ratios)
+    return SpectrumRecord(rate_hz, best, judged, computed / spectrum.interpolate(judged))
 
 
 def _make_envelope(count: int, rate_hz: float, shape: RecordShape) -> Float1D:

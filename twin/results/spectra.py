@@ -1,4 +1,4 @@
-"""Response spectra, shock response spectra, Fourier spectra and energy of an acceleration record.
+"""Response, shock and Fourier spectra, and intensity measures, of an acceleration record.
 
 A record is taken as piecewise linear between its samples. The motion of a linear oscillator of one
 degree of freedom on it,
@@ -15,7 +15,6 @@ period more, in which a peak after the record is found (the residual part of a s
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -35,51 +34,17 @@ MAX_SERIES_ANGLE = 0.5  # rad, to which the argument is halved before
 Float3D = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ResponseSpectrum:
-    """Peaks of linear oscillators on a record, each (frequency,), and the energy that they take up.
-
-    `absolute_acceleration` is that of the mass in the laboratory frame, what an accelerometer on it
-    reads. `pseudo_acceleration` is w^2 times the largest relative displacement; without damping
-    both are the same. `input_energy` is relative (Uang and Bertero, 1990): the work of -a per mass
-    up to the end.
-    """
-
-    frequencies_hz: Float1D
-    damping: float
-    absolute_acceleration_m_s2: Float1D
-    pseudo_acceleration_m_s2: Float1D
-    relative_velocity_m_s: Float1D
-    relative_displacement_m: Float1D
-    input_energy_j_kg: Float1D
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ShockSpectrum:
-    """Shock response spectrum of the absolute acceleration, ISO 18431-4; magnitudes in m/s2.
-
-    `positive` and `negative`, (frequency,), are the largest responses in either direction, during
-    and after the record.
-    """
-
-    frequencies_hz: Float1D
-    damping: float
-    positive_m_s2: Float1D
-    negative_m_s2: Float1D
-
-
 class OscillatorSteps(NamedTuple):
     """How oscillators advance by a substep: coefficients (frequency, 2, 4), counts (frequency,).
 
     The rows give (z, y) at the end, the columns multiply z, y and the ground acceleration at the
     begin and at the end. A sample interval has `substeps` of them; `rest` intervals of samples
-    follow the record. `angle` is w times the substep.
+    follow the record.
     """
 
     coefficients: Float3D
     substeps: Int1D
     rest: Int1D
-    angle: Float1D
     damping: float
 
 
@@ -103,24 +68,15 @@ def compute_response_spectrum(
     frequencies_hz: Float1D,
     damping: float = DEFAULT_DAMPING,
     points_per_cycle: float = POINTS_PER_CYCLE,
-) -> ResponseSpectrum:
-    """Return the elastic response spectrum of a ground acceleration in m/s2, (sample,).
+) -> Float1D:
+    """Return the elastic response spectrum of a ground acceleration in m/s2, (frequency,).
 
-    `points_per_cycle` at least are searched for the peaks; 0 searches the samples alone.
+    Of the absolute acceleration: that of the mass in the laboratory frame, what an accelerometer on
+    it reads. `points_per_cycle` at least are searched for the peaks; 0 searches the samples alone.
     ValueError if a sample is missing (NaN), or the damping is not that of an oscillation.
     """
-    peaks = _compute_peaks(acceleration, rate_hz, frequencies_hz, damping, points_per_cycle)
-    w = 2 * math.pi * np.asarray(frequencies_hz, dtype=np.float64)
-    absolute = np.maximum(peaks[:, 0], -peaks[:, 1])
-    return ResponseSpectrum(
-        np.array(frequencies_hz, dtype=np.float64),
-        damping,
-        absolute_acceleration_m_s2=absolute,
-        pseudo_acceleration_m_s2=peaks[:, 2].copy(),
-        relative_velocity_m_s=peaks[:, 3] / w,
-        relative_displacement_m=peaks[:, 2] / w**2,
-        input_energy_j_kg=peaks[:, 4] / w**2,
-    )
+    shock = compute_shock_spectrum(acceleration, rate_hz, frequencies_hz, damping, points_per_cycle)
+    return np.maximum(*shock)
 
 
 def compute_shock_spectrum(
@@ -129,16 +85,24 @@ def compute_shock_spectrum(
     frequencies_hz: Float1D,
     damping: float = DEFAULT_DAMPING,
     points_per_cycle: float = POINTS_PER_CYCLE,
-) -> ShockSpectrum:
-    """Return the shock response spectrum of an acceleration in m/s2, (sample,); Q = 1 / (2 zeta).
+) -> tuple[Float1D, Float1D]:
+    """Return the shock response spectrum (positive, negative) in m/s2, (frequency,) each.
 
-    Above a tenth of the sampling rate the straight lines between the samples are no longer the
-    shock. Arguments and ValueError as `compute_response_spectrum`.
+    The largest absolute accelerations in either direction, during and after the record, as
+    magnitudes (ISO 18431-4; Q = 1 / (2 zeta)). Above a tenth of the sampling rate the straight
+    lines between the samples are no longer the shock. Arguments and ValueError as
+    `compute_response_spectrum`.
     """
-    peaks = _compute_peaks(acceleration, rate_hz, frequencies_hz, damping, points_per_cycle)
-    return ShockSpectrum(
-        np.array(frequencies_hz, dtype=np.float64), damping, peaks[:, 0].copy(), -peaks[:, 1]
-    )
+    frequencies = np.ascontiguousarray(frequencies_hz, dtype=np.float64)
+    _require_known(acceleration)
+    if not 0.0 <= damping < 1.0:
+        raise ValueError(f"a damping ratio of {damping:g} is not in 0 .. 1")
+    if frequencies.size and not (frequencies.min() > 0.0 and math.isfinite(frequencies.max())):
+        raise ValueError("a natural frequency is not positive")
+    record = np.ascontiguousarray(acceleration, dtype=np.float64)
+    steps = _prepare_steps(frequencies, rate_hz, damping, points_per_cycle)
+    largest, smallest = follow_oscillators(record, steps)
+    return largest, -smallest
 
 
 def compute_fourier_spectrum(acceleration: Float1D, rate_hz: float) -> tuple[Float1D, Float1D]:
@@ -186,26 +150,6 @@ def _require_known(acceleration: Float1D) -> None:
         raise ValueError(f"{lost} samples are missing: a spectrum needs every sample")
 
 
-def _compute_peaks(
-    acceleration: Float1D,
-    rate_hz: float,
-    frequencies_hz: Float1D,
-    damping: float,
-    points_per_cycle: float,
-) -> Float2D:
-    """Return the rows of `follow_oscillators` by frequency; ValueError as the public functions."""
-    frequencies = np.ascontiguousarray(frequencies_hz, dtype=np.float64)
-    _require_known(acceleration)
-    if not 0.0 <= damping < 1.0:
-        raise ValueError(f"a damping ratio of {damping:g} is not in 0 .. 1")
-    if frequencies.size and not (frequencies.min() > 0.0 and math.isfinite(frequencies.max())):
-        raise ValueError("a natural frequency is not positive")
-    record = np.ascontiguousarray(acceleration, dtype=np.float64)
-    return follow_oscillators(
-        record, _prepare_steps(frequencies, rate_hz, damping, points_per_cycle)
-    )
-
-
 def _prepare_steps(
     frequencies_hz: Float1D, rate_hz: float, damping: float, points_per_cycle: float
 ) -> OscillatorSteps:
@@ -221,7 +165,6 @@ def _prepare_steps(
         np.ascontiguousarray(coefficients),
         substeps.astype(np.int64),
         np.ceil(rate_hz / frequencies_hz).astype(np.int64),
-        angle,
         damping,
     )
 
@@ -250,33 +193,25 @@ def _exponentiate(angle: Float1D, damping: float) -> Float3D:
 
 @jit_kernel()
 def follow_oscillators(acceleration: Float1D, steps: OscillatorSteps) -> Float2D:
-    """Follow oscillators through a record and one period after it; return (frequency, 5) in m/s2.
+    """Follow oscillators through a record and one period after it; return (2, frequency) in m/s2.
 
-    Largest and smallest absolute acceleration -(z + 2 zeta y), largest |z|, largest |y|, and the
-    input energy per mass times w^2, -integral a y d(w t), up to the end of the record. Equation of
-    the module: dz = y, dy = -z - 2 zeta y - a over the time w t.
+    Largest and smallest absolute acceleration -(z + 2 zeta y). Equation of the module: dz = y,
+    dy = -z - 2 zeta y - a over the time w t.
     """
-    peaks = np.zeros((steps.substeps.size, 5))
+    peaks = np.zeros((2, steps.substeps.size))
     for k in range(steps.substeps.size):
         zz, zy, z0, z1 = steps.coefficients[k, 0]
         yz, yy, y0, y1 = steps.coefficients[k, 1]
-        zeta2, n, angle = 2.0 * steps.damping, steps.substeps[k], steps.angle[k]
-        z = y = energy = largest = smallest = most_z = most_y = before = 0.0
+        zeta2, n = 2.0 * steps.damping, steps.substeps[k]
+        z = y = largest = smallest = before = 0.0
         for i in range(acceleration.size + steps.rest[k]):
             after = acceleration[i] if i < acceleration.size else 0.0
             a, slope = before, (after - before) / n
             for j in range(n):
                 b = after if j == n - 1 else before + (j + 1) * slope
-                z_new = zz * z + zy * y + z0 * a + z1 * b
-                y_new = yz * z + yy * y + y0 * a + y1 * b
-                # integral a y = [a z] - slope integral z, with the integral of z from dy.
-                area = zeta2 * (z - z_new) + y - y_new - angle * (a + b) / 2.0
-                energy -= b * z_new - a * z - slope / angle * area
-                z, y, a = z_new, y_new, b
+                z, y, a = zz * z + zy * y + z0 * a + z1 * b, yz * z + yy * y + y0 * a + y1 * b, b
                 response = -(z + zeta2 * y)
                 largest, smallest = max(largest, response), min(smallest, response)
-                most_z, most_y = max(most_z, abs(z)), max(most_y, abs(y))
             before = after
-        peaks[k, 0], peaks[k, 1], peaks[k, 2] = largest, smallest, most_z
-        peaks[k, 3], peaks[k, 4] = most_y, energy
+        peaks[0, k], peaks[1, k] = largest, smallest
     return peaks

@@ -174,7 +174,7 @@ def _check_required(
         spectrum = compute_response_spectrum(
             motion.achieved_acc_m_s2, motion.rate_hz, hz, config.damping
         )
-        ratios = spectrum.absolute_acceleration_m_s2 / required.interpolate(hz)
+        ratios = spectrum / required.interpolate(hz)
     result = _find_extremes(hz, ratios, (config.required_lower, config.required_upper))
     return RequiredSpectrumResult(**dict(result), passed=result.outside == 0)
 

@@ -242,7 +242,7 @@ def compare_spectra(
     """
     hz = list_octave_frequencies(*band_hz, per_octave)
     target, achieved = (
-        compute_response_spectrum(record, rate_hz, hz, damping).absolute_acceleration_m_s2
+        compute_response_spectrum(record, rate_hz, hz, damping)
         for record in (target_acc, achieved_acc)
     )
     return hz, achieved / target
