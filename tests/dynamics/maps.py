@@ -24,9 +24,9 @@ def model_map(gap_m: float = 0.004, frequency_hz: float = 3.4, **changes: float)
     return ClosedFormMap(Model(snm(gap_m, **changes)), frequency_hz, AG)
 
 
-def settle(period_map: PeriodMap, frequency_hz: float, **keywords) -> Orbit:
+def settle(period_map: PeriodMap, frequency_hz: float) -> Orbit:
     """The orbit reached from rest at a frequency."""
-    orbit = settle_to_orbit(period_map.with_parameter("frequency", frequency_hz), **keywords)
+    orbit = settle_to_orbit(period_map.with_parameter("frequency", frequency_hz))
     assert orbit is not None
     return orbit
 

@@ -79,7 +79,7 @@ def draw_basin_map(basins: Basins, unstable: Float2D | None = None) -> Captioned
     for index, (attractor, colour, share) in enumerate(
         zip(basins.attractors, colours, basins.fractions, strict=True)
     ):
-        _plot_attractor(ax, attractor, colour)
+        _plot_attractor(ax, attractor)
         kind = describe_kind(basins.attractors, index)
         text = f"{kind}, {1e3 * attractor.u_max:.3f} mm: {share:.1%}"
         handles.append(Patch(color=colour, label=text))
@@ -126,7 +126,7 @@ def _attractor_colours(attractors: Sequence[Attractor]) -> list[tuple[float, flo
     return colours
 
 
-def _plot_attractor(ax: Axes, attractor: Attractor, colour: tuple[float, float, float]) -> None:
+def _plot_attractor(ax: Axes, attractor: Attractor) -> None:
     u, v = 1e3 * attractor.points[:, U], 1e3 * attractor.points[:, V]
     if attractor.is_periodic:
         ax.plot(u, v, "o", mfc="#111111", mec="#ffffff", mew=1.1, ms=7, zorder=5)

@@ -232,15 +232,15 @@ def _find_own_limits(panel: FigurePanel, axis: int) -> tuple[float, float]:
     return low, high
 
 
-def reduce_line(x: Float1D, y: Float1D, limit: int = MAX_POINTS) -> tuple[Float1D, Float1D]:
-    """Return at most about `limit` points of a line, (points,) each, that look the same.
+def reduce_line(x: Float1D, y: Float1D) -> tuple[Float1D, Float1D]:
+    """Return at most about MAX_POINTS points of a line, (points,) each, that look the same.
 
     Of every piece of equally many samples those at the extremes of x and y, in order, and a missing
     one; so no peak and no gap is lost.
     """
-    if x.size <= limit:
+    if x.size <= MAX_POINTS:
         return x, y
-    length = -(-4 * x.size // limit)
+    length = -(-4 * x.size // MAX_POINTS)
     starts = np.arange(0, x.size, length)
     kept = {0, x.size - 1}
     for values in (x, y):
@@ -255,13 +255,11 @@ def reduce_line(x: Float1D, y: Float1D, limit: int = MAX_POINTS) -> tuple[Float1
     return x[index], y[index]
 
 
-def reduce_envelope(
-    x: Float1D, low: Float1D, high: Float1D, limit: int = MAX_POINTS
-) -> tuple[Float1D, Float1D, Float1D]:
-    """Return at most `limit` points of an envelope, with the lowest and highest of those joined."""
-    if x.size <= limit:
+def reduce_envelope(x: Float1D, low: Float1D, high: Float1D) -> tuple[Float1D, Float1D, Float1D]:
+    """Return at most MAX_POINTS points of an envelope, with the extremes of those joined."""
+    if x.size <= MAX_POINTS:
         return x, low, high
-    starts = np.arange(0, x.size, -(-x.size // limit))
+    starts = np.arange(0, x.size, -(-x.size // MAX_POINTS))
     return x[starts], np.fmin.reduceat(low, starts), np.fmax.reduceat(high, starts)
 
 

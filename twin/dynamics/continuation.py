@@ -367,7 +367,7 @@ class _Trace:
         try:
             new = self._correct(guess, tangent, weights)
         except NoConvergence as error:
-            self._retry(last, tangent, weights, error)
+            self._retry(last, tangent, error)
             return
         turn_cos = float((new.tangent * weights) @ (tangent * weights))
         if not self._limits[0] <= new.z[-1] <= self._limits[1]:
@@ -510,7 +510,7 @@ class _Trace:
             return
         self._turn_grazing(last, *located, beyond, new.z - last.z)
 
-    def _retry(self, last: Point, tangent: Float1D, weights: Float1D, error: NoConvergence) -> None:
+    def _retry(self, last: Point, tangent: Float1D, error: NoConvergence) -> None:
         """Reduce the step; where it is small, pass a grazing orbit at which the branch turns."""
         if self._step < BEND_STEP:
             try:

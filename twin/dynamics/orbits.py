@@ -283,10 +283,8 @@ def find_attracting_orbit(
     return reduce_period(orbit) if is_near else None
 
 
-def settle_to_orbit(
-    period_map: PeriodMap, start: Float1D | None = None, periods: int = 1
-) -> Orbit | None:
+def settle_to_orbit(period_map: PeriodMap, start: Float1D | None = None) -> Orbit | None:
     """Return the stable orbit to which x = start (or rest) settles, or None."""
     x = period_map.iterate(period_map.rest() if start is None else start, SETTLING_PERIODS)
-    orbit = find_orbit(period_map, x, periods)
+    orbit = find_orbit(period_map, x)
     return orbit if orbit is not None and orbit.stable else None

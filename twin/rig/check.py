@@ -113,7 +113,7 @@ def print_plan(console: Console, checked: CheckedTest) -> None:
     for name, text in _plan_lines(config):
         console.print(f"  {name:<11}{text}", highlight=False, soft_wrap=True)
     print_table(console, _make_steps_table(config))
-    print_table(console, _make_sensors_table(config, checked.peaks))
+    print_table(console, _make_sensors_table(checked.peaks))
     for sentence in checked.warnings:
         console.print(f"warning: {sentence}", highlight=False, soft_wrap=True)
     console.print("ready: nothing exceeds the limits of the rig file", highlight=False)
@@ -444,7 +444,7 @@ def select_rows(rows: list[StepDemand], limits: tuple[RigLimit, ...]) -> list[St
     return [row for row in rows if row.frequency_hz in kept_hz]
 
 
-def _make_sensors_table(config: RunConfig, rows: tuple[PredictedPeak, ...]) -> Table:
+def _make_sensors_table(rows: tuple[PredictedPeak, ...]) -> Table:
     """Make the table of the peaks that the model predicts for each sensor."""
     title = "sensors, as the model foresees them"
     table = Table(title=title, box=SIMPLE_HEAD, title_justify="left")
