@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from table_io.block import Label
 from table_io.units import GRAVITY_M_S2
 
+RESPONSE_RATIOS = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")  # of a NormalizedResponse
+
 
 @dataclass(frozen=True, slots=True)
 class Step:

@@ -135,13 +135,12 @@ def test_hysteresis_of_an_integrated_model_is_that_of_slow_passage(tmp_path: Pat
     touched = {"forward": hit > 0.1, "backward": back > 0.1}
     states = {direction: np.zeros((f.size, 14)) for direction in ("forward", "backward")}
     eta = {"forward": hit, "backward": back}
-    fold = findings.find_folds(case, SlowSweep(f, eta, eta, touched, states))
+    sweep = SlowSweep(f, states, eta, eta, touched)
+    fold = findings.find_folds(case, sweep)
     assert fold is not None
     assert (fold.kind, fold.method) == ("right", "slow passage")
     assert (fold.backward_hz, fold.forward_hz) == (pytest.approx(3.0), pytest.approx(3.5))
-    assert findings.find_graze_hz(case, SlowSweep(f, eta, eta, touched, states)) == pytest.approx(
-        2.98
-    )
+    assert findings.find_graze_hz(case, sweep) == pytest.approx(2.98)
 
 
 @pytest.mark.slow

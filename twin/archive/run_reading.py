@@ -10,6 +10,7 @@ from pathlib import Path
 from table_io.config.base import parse_toml
 from table_io.config.profile import Specimen
 from table_io.errors import InputError
+from table_io.records import RESPONSE_RATIOS
 from table_io.units import GRAVITY_M_S2
 from twin.archive.notes import NOTES_FILE, read_notes
 from twin.archive.run_row import Row, RunRow
@@ -23,7 +24,7 @@ from twin.results.summary import parse_toml_tables
 from twin.system.files import hash_file
 
 HALF_WIDTH_SIGMA = 1.96  # of a 95 % interval, in standard deviations
-SIDES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l", "drift", "spread")  # of a response
+SIDES = (*RESPONSE_RATIOS, "drift", "spread")  # of a response
 
 
 def read_run(folder: Path, name: str, before: Row | None = None) -> tuple[RunRow, list[Row] | None]:

@@ -8,7 +8,7 @@ start of the run.
 
 import json
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from heapq import merge
 from operator import itemgetter
 from typing import Any, BinaryIO
@@ -17,7 +17,7 @@ import numpy as np
 
 from table_io.block import Int1D
 from table_io.channels import TIME_COLUMN
-from table_io.records import Event, NormalizedResponse, PrcPoint, Record, format_record
+from table_io.records import RESPONSE_RATIOS, Event, PrcPoint, Record, format_record
 from twin.recording.mcap_log import open_foreign_log
 from twin.recording.reader import find_start_ns
 from twin.recording.tabular import (
@@ -37,9 +37,7 @@ EVENTS_TOPIC = "/events"
 Fields = list[tuple[str, str]]  # name, protobuf type; numbered from 2, after the timestamp
 LOG_FIELDS: Fields = [("level", "int32"), ("message", "string"), ("name", "string")]
 LEVEL_WARNING, LEVEL_INFO = 3, 2  # levels of foxglove.Log
-PRC_QUANTITIES = [
-    field.name for field in fields(NormalizedResponse) if field.type in (float, "float")
-]
+PRC_QUANTITIES = [*RESPONSE_RATIOS, "drift", "spread"]
 MAX_PLOTS = 5
 FOLLOW_WINDOW_S = 10.0
 PRC_COLUMNS = [

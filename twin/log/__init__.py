@@ -42,6 +42,7 @@ from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.errors import InputError, format_pip_line
 from table_io.records import (
+    RESPONSE_RATIOS,
     CycleExtremes,
     Event,
     Fault,
@@ -371,7 +372,7 @@ class Log:
             for name in ("step", "direction", "frequency_hz")
         }
         for source, prefix in (("measured", ""), ("twin", "twin_")):
-            for name in ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l"):
+            for name in RESPONSE_RATIOS:
                 values = (getattr(point, source) for point in points)
                 curves[prefix + name] = np.array(
                     [_get_value(quantities, name) for quantities in values]

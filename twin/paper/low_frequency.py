@@ -12,7 +12,7 @@ import numpy as np
 from table_io.block import Float1D
 from table_io.records import Step
 from twin.compare.curves import Hysteresis, detect_hysteresis
-from twin.paper.slow_passage import choose_effort
+from twin.paper.slow_passage import SettledSweep, choose_effort
 from twin.results import ideal_points
 from twin.results.paper_cases import PaperCase
 from twin.results.players import SystemMotion
@@ -27,22 +27,15 @@ SEQUENCE_CYCLES = 60  # cycles of which impacts are measured one by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SecondaryResonances:
-    """Left hystereses below 1.7 Hz, in Hz, and the state at the end of every step of the scan."""
+class SecondaryResonances(SettledSweep):
+    """Scan of the low frequencies, with the left hystereses below 1.7 Hz, in Hz."""
 
-    frequency: Float1D
     intervals: tuple[Hysteresis, ...]
-    states: dict[str, Float1D]
 
     @property
     def resonances_hz(self) -> list[float]:
         """Upper ends of the intervals: the last frequency before the forward sweep jumps up."""
         return [interval.to_hz for interval in self.intervals]
-
-    def state_at(self, frequency_hz: float, direction: str) -> Float1D:
-        """Return the state reached at the nearest frequency in one direction."""
-        index = int(np.abs(self.frequency - frequency_hz).argmin())
-        return np.asarray(self.states[direction][index])
 
 
 def find_secondary_resonances(case: PaperCase) -> SecondaryResonances:
@@ -65,7 +58,7 @@ def find_secondary_resonances(case: PaperCase) -> SecondaryResonances:
         if interval.kind == "left" and interval.to_hz - interval.from_hz > MIN_WIDTH_HZ
     ]
     states = {"forward": response.states[:count], "backward": response.states[count:][::-1]}
-    return SecondaryResonances(grid_hz, tuple(intervals), states)
+    return SecondaryResonances(grid_hz, states, tuple(intervals))
 
 
 def nearest_hz(frequencies_hz: list[float], frequency_hz: float) -> float | None:

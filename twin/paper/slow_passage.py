@@ -34,14 +34,25 @@ def choose_effort(case: PaperCase) -> SearchEffort:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SlowSweep:
-    """Slow sweep: ratios and final state at each frequency, keyed by direction."""
+class SettledSweep:
+    """Frequencies of a sweep in Hz, and the state at the end of each, keyed by direction."""
 
     frequency: Float1D
+    states: dict[str, Float1D]
+
+    def state_at(self, frequency_hz: float, direction: str) -> Float1D:
+        """Return the state reached at the nearest frequency in one direction."""
+        index = int(np.abs(self.frequency - frequency_hz).argmin())
+        return np.asarray(self.states[direction][index])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlowSweep(SettledSweep):
+    """Slow sweep with ratios at each frequency, keyed by direction."""
+
     eta_d: dict[str, Float1D]
     eta_a: dict[str, Float1D]
     has_contact: dict[str, npt.NDArray[np.bool_]]
-    states: dict[str, Float1D]
 
     @property
     def peak(self) -> tuple[int, str]:
@@ -59,10 +70,6 @@ class SlowSweep:
         forward, backward = self.eta_d["forward"], self.eta_d["backward"]
         high = self.frequency > 2
         return float((np.abs(forward - backward) / np.maximum(forward, backward))[high].max())
-
-    def state_at(self, frequency_hz: float, direction: str) -> Float1D:
-        index = int(np.abs(self.frequency - frequency_hz).argmin())
-        return np.asarray(self.states[direction][index])
 
 
 def run_slow_sweep(case: PaperCase) -> SlowSweep:
@@ -84,4 +91,4 @@ def run_slow_sweep(case: PaperCase) -> SlowSweep:
         eta_a[direction] = ((last["a_max"] - last["a_min"]) / (2 * a_star))[::stride]
         has_contact[direction] = (last["f_r_max"] - last["f_l_min"] > 0)[::stride]
         states[direction] = sweep.states[::stride]
-    return SlowSweep(grid_hz, eta_d, eta_a, has_contact, states)
+    return SlowSweep(grid_hz, states, eta_d, eta_a, has_contact)

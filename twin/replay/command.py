@@ -14,6 +14,7 @@ from rich.table import Table
 from table_io.block import Block
 from table_io.clock import RealClock
 from table_io.errors import InputError
+from table_io.records import RESPONSE_RATIOS
 from twin.recording.reader import read_recording
 from twin.recording.run_paths import resolve_log_path
 from twin.recording.tabular import parse_step_range
@@ -46,7 +47,6 @@ from twin.system.versions import format_version_changes
 from twin.transport.codec import TOPIC_TYPES, Item
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
-PRC_QUANTITIES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 TABLE_COLUMNS = {
     "u": "nrmse rel_disp_m", "a": "nrmse mass_acc_m_s2", "F_R": "nrmse force_r1_n",
     "F_L": "nrmse force_l1_n", "u free": "free_nrmse rel_disp_m", "PRC eta_d": "prc eta_d",
@@ -304,7 +304,7 @@ def _make_row(log: str, model: str | None, summary: RunSummary, entry: ReplayRes
         same_model=entry.model == RECORDED,
         identical=entry.identical,
         gaps=summary.gaps,
-        errors=nrmse | {f"prc {name}": _prc_error(pairs, name) for name in PRC_QUANTITIES},
+        errors=nrmse | {f"prc {name}": _prc_error(pairs, name) for name in RESPONSE_RATIOS},
         steps=len(pairs),
         steps_with_the_same_impacts=sum(
             _count_impacts(rig) == _count_impacts(twin) for rig, twin in pairs

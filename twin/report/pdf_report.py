@@ -8,7 +8,7 @@ import matplotlib as mpl
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.figure import Figure
 
-from table_io.records import format_kind
+from table_io.records import RESPONSE_RATIOS, format_kind
 from twin.drawing.pictures import RC_PARAMS, render_figure
 from twin.drawing.plot_style import FIGURE_WIDTH_IN
 from twin.report.figures import draw_figures
@@ -19,7 +19,6 @@ from twin.results.twin_verdict import format_jump, format_twin_verdict
 
 PAGE_IN = (FIGURE_WIDTH_IN, FIGURE_WIDTH_IN * 2**0.5)  # as A4
 LINES_PER_PAGE, COLUMNS = 78, 122
-STEP_COLUMNS = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 
 
 def write_pdf_report(run: ReportData, path: Path) -> None:
@@ -67,12 +66,12 @@ def _format_gap(run: ReportData) -> str:
 
 
 def _tabulate_steps(run: ReportData) -> list[str]:
-    heads = "".join(f"{name:>16}" for name in STEP_COLUMNS)
+    heads = "".join(f"{name:>16}" for name in RESPONSE_RATIOS)
     lines = [f"{'f in Hz':>8} {'':9}{heads}"] if run.steps else []
     for step in run.steps:
         pairs = [
             [step_quantity(step, source, name) for source in ("measured", "twin")]
-            for name in STEP_COLUMNS
+            for name in RESPONSE_RATIOS
         ]
         cells = "".join(f"{measured:8.3f}|{twin:<7.3f}" for measured, twin in pairs)
         lines.append(f"{step.frequency_hz:8.3f} {step.direction:9}{cells}")

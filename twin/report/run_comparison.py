@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
 
+from table_io.records import RESPONSE_RATIOS
 from twin.laws.library import find_effect
 from twin.recording.reader import Recording
 from twin.results.contracts import (
@@ -21,7 +22,6 @@ from twin.results.contracts import (
 )
 from twin.results.twin_verdict import format_misfit
 
-RESPONSES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 BASE_UNITS = {
     "mass": "kg", "stiffness": "N/m", "damping": "N s/m", "bumper_stiffness_r": "N/m",
     "bumper_damping_r": "N s/m", "bumper_stiffness_l": "N/m", "bumper_damping_l": "N s/m",
@@ -198,7 +198,9 @@ def _pair_steps(first: Sequence[StepEntry], second: Sequence[StepEntry]) -> list
 
 
 def _pair_responses(first: Response | None, second: Response | None) -> dict[str, Pair]:
-    return {name: [getattr(entry, name, None) for entry in (first, second)] for name in RESPONSES}
+    return {
+        name: [getattr(entry, name, None) for entry in (first, second)] for name in RESPONSE_RATIOS
+    }
 
 
 def _pair_jumps(first: Sequence[Jump], second: Sequence[Jump]) -> list[JumpPair]:

@@ -12,7 +12,7 @@ from table_io.config.base import parse_toml
 from table_io.config.folders import find_config
 from table_io.config.profile import Profile, Specimen
 from table_io.errors import InputError
-from table_io.records import PrcPoint
+from table_io.records import RESPONSE_RATIOS, PrcPoint
 from table_io.units import GRAVITY_M_S2
 from twin.compare.curves import detect_hysteresis
 from twin.dynamics.period_map import set_total_gap
@@ -27,7 +27,6 @@ from twin.setup.law_limits import check_laws
 from twin.setup.run_config import read_model
 from twin.studies.result import (
     IMPACT_COLUMNS,
-    RATIO_COLUMNS,
     CaseSummary,
     Row,
     SweepPeak,
@@ -252,7 +251,7 @@ def _make_rows(case: StudyCase, points: Sequence[PrcPoint]) -> Iterator[Row]:
                 "gap_mm": case.gap_mm,
                 "direction": point.direction,
                 "frequency_hz": point.frequency_hz,
-                **{name: getattr(point.twin, name) for name in RATIO_COLUMNS},
+                **{name: getattr(point.twin, name) for name in RESPONSE_RATIOS},
                 **{name: _mean_impacts(getattr(point.twin, name)) for name in IMPACT_COLUMNS},
             }
 

@@ -9,14 +9,14 @@ from typing import Literal
 from pydantic import field_serializer
 
 from table_io.errors import InputError
+from table_io.records import RESPONSE_RATIOS
 from twin.results.contract import Contract
 from twin.results.contracts import HysteresisInterval, Jump
 
 Row = dict[str, str | float]
 
-RATIO_COLUMNS = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 IMPACT_COLUMNS = ("impacts_right", "impacts_left")
-COLUMNS = ("model", "gap_mm", "direction", "frequency_hz", *RATIO_COLUMNS, *IMPACT_COLUMNS)
+COLUMNS = ("model", "gap_mm", "direction", "frequency_hz", *RESPONSE_RATIOS, *IMPACT_COLUMNS)
 TEXT_COLUMNS = ("model", "direction")
 REMEDY = "give a folder written by simulate"
 

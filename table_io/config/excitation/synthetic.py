@@ -16,7 +16,7 @@ from table_io.config.excitation import (
 )
 from table_io.config.excitation.waveform import (
     LevelPoints,
-    check_level_points,
+    check_points_in_band,
     integrate_frequency,
     interpolate_level,
     repeat_with_pauses,
@@ -218,12 +218,7 @@ class Chirp(History):
             raise InputError("stop_hz is start_hz", remedy="sweep, or use kind sine_pulse")
         return stop
 
-    @field_validator("level_points")
-    @classmethod
-    def _check_points(cls, points: LevelPoints, info: ValidationInfo) -> LevelPoints:
-        if points and {"start_hz", "stop_hz"} <= info.data.keys():
-            check_level_points(points, (info.data["start_hz"], info.data["stop_hz"]))
-        return points
+    _check_level_points = field_validator("level_points")(check_points_in_band)
 
     def displacement(self, rate_hz: float) -> Float1D:
         """Return the swept sine in m, (sample,)."""

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from table_io.records import NormalizedResponse
+from table_io.records import RESPONSE_RATIOS, NormalizedResponse
 from twin.compare.curves import FloatND, Hysteresis, PrcJump
 from twin.dynamics.basins import StartGrid, compute_basins
 from twin.dynamics.continuation import Branch
@@ -16,13 +16,12 @@ from twin.studies.maps.cases import SampledCase
 from twin.studies.maps.outcomes import CURVE_DIMS, CaseChunk, Outcome, OutcomeVariable
 
 Arrays = Mapping[str, npt.NDArray[Any]]
-CURVE_NAMES = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")
 
 
 def compute_curves(chunk: CaseChunk) -> Arrays:
     """Return the pseudo-resonance curves, and the mean number of impacts a cycle."""
     arrange = chunk.sweep.arrange
-    curves = {name: arrange(chunk.ratios[name]).astype(np.float32) for name in CURVE_NAMES}
+    curves = {name: arrange(chunk.ratios[name]).astype(np.float32) for name in RESPONSE_RATIOS}
     for name, extreme in (("impacts_right", "onsets_r"), ("impacts_left", "onsets_l")):
         curves[name] = arrange(chunk.extreme(extreme).mean(axis=-1)).astype(np.float32)
     return curves
