@@ -302,13 +302,18 @@ def test_five_seconds_are_refused_and_a_sound_log_is_not() -> None:
 
 
 def test_the_peaks_of_a_late_sine_are_no_clipping() -> None:
-    """Rounded to 16 bits, a slow sine stays at its extreme value for many samples."""
+    """Rounded to 16 bits, a slow sine stays at its extreme value for many samples.
+
+    One that is cut at 0.9 of its peak is refused.
+    """
     times = np.arange(round(60.0 * RATE_HZ)) / RATE_HZ
     command, table = (
         np.round(0.02 * np.sin(math.tau * 0.5 * (times - late)) / 3e-6) * 3e-6
         for late in (0.0, 0.06)
     )
     check_motion(name_motion(command, table))
+    with pytest.raises(InputError, match="clip"):
+        check_motion(name_motion(command, np.clip(table, -0.018, 0.018)))
 
 
 def test_the_band_ends_where_noise_begins() -> None:

@@ -13,9 +13,9 @@ import pytest
 from table_io.records import Event, RunStop
 from tests.live.test_live import (
     QUICK,
-    assert_at_rest,
     assert_whole,
     finish,
+    finish_at_rest,
     replay_run,
     running,
     start,
@@ -60,11 +60,7 @@ def test_a_disk_that_has_room_again_loses_nothing_but_the_table_rests(tmp_path: 
     limit_recording(process, tmp_path, 50_000)
     time.sleep(1.5)
     limit_recording(process, tmp_path, -1)
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 3, output
-    assert_whole(recording)
-    assert_at_rest(recording)
-    assert summary["verdict"] == "stopped"
+    _, recording, _ = finish_at_rest(process, tmp_path, 3, "stopped")
     assert [event.kind for event in recording.records(Event)].count("disk") == 2
     assert "identical to the bit" in replay_run(tmp_path).stdout
 
@@ -79,11 +75,7 @@ def test_a_folder_that_is_taken_away_loses_nothing_but_the_table_rests(
         shutil.rmtree(tmp_path / "out")
     else:
         (tmp_path / "out").rename(tmp_path / "elsewhere")
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 3, output
-    assert_whole(recording)
-    assert_at_rest(recording)
-    assert summary["verdict"] == "stopped"
+    output, recording, _ = finish_at_rest(process, tmp_path, 3, "stopped")
     assert "Traceback" not in output
     stop = recording.records(RunStop)[0].index / recording.start.rate_hz
     lost, _restored = (event.index for event in recording.records(Event) if event.kind == "disk")

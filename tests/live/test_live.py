@@ -100,6 +100,26 @@ def assert_whole(recording: Recording) -> None:
     assert [block.index for block in recording.contiguous_blocks("meas")] == [0]
 
 
+def assert_at_rest(recording: Recording) -> None:
+    """The command ends at zero, and nowhere on the way does it ask for more than a blend may."""
+    whole = recording.contiguous_blocks("meas")[-1]
+    command = whole.channel("drive_disp_m")
+    assert abs(command[-100:]).max() < 1e-6
+    # smooth over 20 samples: the DAC's steps are not the drive's
+    assert abs(command[20:] - command[:-20]).max() < 20 / whole.rate_hz * 0.05
+
+
+def finish_at_rest(
+    process: subprocess.Popen[str], folder: Path, code: int, verdict: str
+) -> tuple[str, Recording, dict]:
+    """(output, recording, summary) of a run with this end: nothing is lost, the table rests."""
+    actual_code, output, recording, summary = finish(process, folder)
+    assert (actual_code, summary["verdict"]) == (code, verdict), output
+    assert_whole(recording)
+    assert_at_rest(recording)
+    return output, recording, summary
+
+
 def replay_run(folder: Path) -> subprocess.CompletedProcess[str]:
     return call_main("replay", folder / "out", "--out", folder / "again")
 
@@ -222,32 +242,15 @@ def test_a_dead_twin_stops_the_table_where_so_configured(tmp_path: Path) -> None
     process = start(tmp_path, profile=QUICK + '[on_death]\ntwin = "stop"\n')
     running(process)
     kill(process, "twin")
-    code, output, recording, summary = finish(process, tmp_path)
-    assert summary["verdict"] == "stopped", output
-    assert_whole(recording)
-    assert code == 3
+    _, _, summary = finish_at_rest(process, tmp_path, 3, "stopped")
     assert summary["reason"].startswith("twin died")
-    assert_at_rest(recording)
-
-
-def assert_at_rest(recording: Recording) -> None:
-    """The command ends at zero, and nowhere on the way does it ask for more than a blend may."""
-    whole = recording.contiguous_blocks("meas")[-1]
-    command = whole.channel("drive_disp_m")
-    assert abs(command[-100:]).max() < 1e-6
-    # smooth over 20 samples: the DAC's steps are not the drive's
-    assert abs(command[20:] - command[:-20]).max() < 20 / whole.rate_hz * 0.05
 
 
 def test_ctrl_c_decays_to_rest_and_closes_the_recording(tmp_path: Path) -> None:
     process = start(tmp_path)
     running(process)
     process.send_signal(signal.SIGINT)
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 130, output
-    assert summary["verdict"] == "stopped"
-    assert_whole(recording)
-    assert_at_rest(recording)
+    _, recording, _ = finish_at_rest(process, tmp_path, 130, "stopped")
     assert recording.contiguous_blocks("meas")[-1].end < recording.start.planned_samples
 
 

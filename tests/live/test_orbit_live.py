@@ -10,9 +10,8 @@ import pytest
 
 from table_io.records import Event, Fault
 from tests.live.test_live import (
-    assert_at_rest,
-    assert_whole,
     finish,
+    finish_at_rest,
     kill,
     read_until,
     replay_run,
@@ -51,11 +50,7 @@ def test_an_orbit_is_held_on_though_the_twin_dies(tmp_path: Path) -> None:
     read_until(process, r".*twin died")
     time.sleep(CAPTURE_S)
     process.send_signal(signal.SIGINT)
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 130, output
-    assert summary["verdict"] == "stopped"
-    assert_whole(recording)
-    assert_at_rest(recording)
+    _, recording, _ = finish_at_rest(process, tmp_path, 130, "stopped")
     (fault,) = recording.records(Fault)
     assert fault.component == "twin"
     assert not any(event.kind == "lost" for event in recording.records(Event))

@@ -13,7 +13,7 @@ from tests.live.test_live import (
     assert_at_rest,
     assert_whole,
     find_component,
-    finish,
+    finish_at_rest,
     pids,
     running,
     start,
@@ -64,12 +64,8 @@ def test_a_closed_terminal_stops_the_table_in_order(number: signal.Signals, tmp_
     process = start(tmp_path)
     running(process)
     process.send_signal(number)
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 130, output
-    assert summary["verdict"] == "stopped"
+    _, _, summary = finish_at_rest(process, tmp_path, 130, "stopped")
     assert f"interrupted ({number.name})" in summary["reason"]
-    assert_whole(recording)
-    assert_at_rest(recording)
     wait_for_end(tmp_path)
 
 
@@ -104,8 +100,4 @@ def test_a_paused_terminal_pauses_no_test(tmp_path: Path) -> None:
     )
     assert state.stdout.strip() == "T", "it was not paused"
     process.send_signal(signal.SIGCONT)
-    code, output, recording, summary = finish(process, tmp_path)
-    assert code == 0, output
-    assert summary["verdict"] == "complete"
-    assert_whole(recording)
-    assert_at_rest(recording)
+    finish_at_rest(process, tmp_path, 0, "complete")

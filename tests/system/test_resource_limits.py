@@ -44,9 +44,16 @@ def test_a_run_under_too_low_a_limit_is_refused_with_the_limit(
 
 
 def test_stop_command_is_sent_with_any_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(entry, "send_order", lambda words: True)
+    sent: list[list[str]] = []
+
+    def send(words: list[str]) -> bool:
+        sent.append(words)
+        return True
+
+    monkeypatch.setattr(entry, "send_order", send)
     monkeypatch.setattr(entry, "require_memory", lambda _: pytest.fail("the order was delayed"))
     entry.run_words(["control", "stop"])
+    assert sent == [["control", "stop"]]
 
 
 def test_memory_that_runs_out_is_one_message(

@@ -28,13 +28,6 @@ from twin.viewer.view import RerunView, write_rrd
 LINE_STRIDE = 4  # lines are drawn with 500 points per second
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("view") / "view.rrd"
-    write_rrd(recording([*blocks(), *records()]), out)
-    return out
-
-
 def test_values_and_times_are_those_of_the_blocks(whole: Path) -> None:
     measured, predicted = samples()
     table, mass, force = measured[1], measured[3], measured[5] + measured[6]

@@ -22,15 +22,8 @@ from tests.viewer.example_run import (
 from twin.viewer import window
 from twin.viewer.address import find_free_address, format_live_view, parse_address, viewer_url
 from twin.viewer.plots import BACKGROUND_COLOUR, LINE_STYLES, Rgb
-from twin.viewer.view import RerunView, write_rrd
+from twin.viewer.view import RerunView
 from twin.viewer.window import open_viewer, serve_web_viewer, take_screenshot
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("view") / "view.rrd"
-    write_rrd(recording([*blocks(), *records()]), out)
-    return out
 
 
 def free_port() -> int:
