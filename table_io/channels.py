@@ -61,8 +61,7 @@ CHANNEL_BY_NAME = {channel.name: channel for channel in CHANNELS}
 
 RIGHT_CELLS = ("force_r1_n", "force_r2_n")
 LEFT_CELLS = ("force_l1_n", "force_l2_n")
-
-
+CONTROL_CHANNELS = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")  # needed by the controller
 RELATIVE_DISP = "rel_disp_m"
 RELATIVE_DISP_SOURCES = ("mass_disp_m", "table_disp_m")  # their difference, unless it is measured
 

@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic.functional_validators import ModelWrapValidatorHandler
 from pydantic_core import InitErrorDetails
 
-from table_io.channels import CHANNEL_BY_NAME, Channel
+from table_io.channels import CHANNEL_BY_NAME, CONTROL_CHANNELS, Channel
 from table_io.config.base import (
     ConfigModel,
     NonNegative,
@@ -300,7 +300,7 @@ class RigConfig(ConfigModel):
                 f"sensors name {', '.join(duplicates)} more than once",
                 remedy="one sensor per channel",
             )
-        missing = {"drive_disp_m", "table_disp_m", "table_acc_m_s2"} - set(names)
+        missing = set(CONTROL_CHANNELS) - set(names)
         backend = load_backend(info.data.get("backend", ""))
         if backend is None or not backend.drives:
             missing -= {"drive_disp_m"}  # an external controller may have no command output

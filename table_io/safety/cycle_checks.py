@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Label
-from table_io.channels import LEFT_CELLS, RIGHT_CELLS
+from table_io.channels import CONTROL_CHANNELS, LEFT_CELLS, RIGHT_CELLS
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig
 from table_io.control.sweep_control import combine_levels
@@ -77,10 +77,9 @@ class DriveCycle:
     @cached_property
     def tones(self) -> dict[str, HarmonicFit]:
         """Harmonics of the command ("command"), of its read-back and of the table's channels."""
-        names = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
-        rows = [*(self.clean_channel(name) for name in names), self.command]
+        rows = [*(self.clean_channel(name) for name in CONTROL_CHANNELS), self.command]
         tracked = track_channels(np.array(rows), self.phase, TRACKED_HARMONICS)
-        return dict(zip((*names, "command"), tracked, strict=True))
+        return dict(zip((*CONTROL_CHANNELS, "command"), tracked, strict=True))
 
     @cached_property
     def window(self) -> WeakFormWindow:

@@ -3,14 +3,12 @@
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from table_io.channels import Channel
+from table_io.channels import CONTROL_CHANNELS, Channel
 from table_io.config.profile import Profile
 from table_io.records import Event, Trip
 from table_io.safety import sample_checks as codes
 from table_io.units import GRAVITY_M_S2
 
-# Needed by the controller.
-CONTROL_CHANNELS = frozenset({"drive_disp_m", "table_disp_m", "table_acc_m_s2"})
 MACHINE_ALARM_KINDS = frozenset({"level", "response", "limit"})  # all other kinds are sensor faults
 # Checks are half a cycle apart, so the first and the last of three share no sample.
 CONFIRMATION_CHECKS = 3

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from table_io.block import Float1D, Float2D, Int1D
+from table_io.channels import CONTROL_CHANNELS
 from table_io.compilation import jit_untyped_helper, jit_untyped_kernel
 from table_io.config.profile import Profile
 from table_io.config.rig import RigConfig, TableResponse
@@ -108,8 +109,7 @@ def compute_thresholds(
     full_scale = np.array([sensor.range_si for sensor in rig.sensors])
     lsb = np.array([sensor.lsb_si for sensor in rig.sensors])
     informative = (rms > 0) & (runs < MAX_REST_RUN_S * rate_hz)
-    needed = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
-    drive, table, acceleration = (names.index(name) for name in needed)
+    drive, table, acceleration = (names.index(name) for name in CONTROL_CHANNELS)
     spike_limit = np.maximum(MIN_SPIKE_SIGMA * sigma, MIN_SPIKE_RANGE * full_scale)
     measured = [rig.channel_by_name[name] for name in names]
     on_table = [(channel.quantity, channel.body) == TABLE_ACCELERATION for channel in measured]
@@ -119,7 +119,7 @@ def compute_thresholds(
     steps[[drive, table]] = np.maximum(steps[[drive, table]], rig.output.lsb_m)
     # Where noise proves a sensor alive, slow motion may show as many equal samples as rest.
     following_ratio = rig.table_response.following_ratio
-    must_move = np.isin(names, needed) & ~informative
+    must_move = np.isin(names, CONTROL_CHANNELS) & ~informative
     return Thresholds(
         rate_hz,
         math.ceil(HISTORY_S * rate_hz),

@@ -1,7 +1,6 @@
 """Terminal messages of a campaign, and prompts for the operator."""
 
 import getpass
-from typing import Literal
 
 from rich.table import Table
 
@@ -9,12 +8,10 @@ from table_io.clock import local_datetime
 from twin.campaign.config import PlannedRun
 from twin.campaign.gap_comparison import CRITERIA, format_best, format_gap
 from twin.campaign.result import GapResult, Spread
-from twin.campaign.state import ActiveCampaign, OperatorAnswer, read_part_summaries
+from twin.campaign.state import ActiveCampaign, OperatorAnswer, Reply, read_part_summaries
 from twin.campaign.summary import merge_summaries
 from twin.results.summary import format_summary
 from twin.system.terminal import console, print_line, print_table
-
-Reply = Literal["done", "skipped", "unattended", "not asked"]
 
 
 def format_run_name(campaign: ActiveCampaign, run: PlannedRun) -> str:

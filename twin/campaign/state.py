@@ -34,6 +34,7 @@ CAMPAIGN_FILE, CONFIG_FOLDER, LOCK_FILE = "campaign.toml", "cards", ".lock"
 RIG_RECORDS = re.compile(r"^\[(?:\[calibrations\]|tare)\].*\n?(?:(?!\[).+\n?|\n)*", re.MULTILINE)
 LOCK_TIMEOUT_S = 20.0  # until the processes of a killed campaign have ended
 Status = Literal["planned", "running", "complete", "interrupted", "skipped"]
+Reply = Literal["done", "skipped", "unattended", "not asked"]
 LOG_NAME = "run.mcap"
 
 
@@ -54,7 +55,7 @@ class OperatorAnswer(ConfigModel):
     """Set-up prompt before a run, with the operator's answer."""
 
     asked: str
-    answer: Literal["done", "skipped", "unattended", "not asked"]
+    answer: Reply
     who: str
     at: str
 

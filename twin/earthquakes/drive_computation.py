@@ -16,6 +16,7 @@ import numpy.typing as npt
 from scipy.fft import next_fast_len
 
 from table_io.block import Block, Float1D
+from table_io.channels import CONTROL_CHANNELS
 from table_io.config.excitation.drive_file import ExpectedResponse
 from table_io.config.excitation.waveform import smoothstep
 from table_io.config.profile import Profile
@@ -32,7 +33,6 @@ MAX_AMPLIFICATION = 5.0  # of the inverse
 MAX_ROUNDS = 25
 LEAST_GAIN = 0.01  # relative fall of the error below which the search ends
 SMOOTHING_HZ = 0.5  # of the ratio of what a run lacked to the noise
-CHANNELS = "drive_disp_m", "table_disp_m", "table_acc_m_s2"
 PADDING_S = 4.0  # of rest around the motion, so that its end does not reach its beginning
 
 
@@ -153,7 +153,7 @@ def predict_loop_check(
     if not command.any():
         return None
     values = np.stack([command, *model.simulate(command, rate_hz)])
-    block = Block("meas", 0, rate_hz, CHANNELS, values, *state.drive.labels(0, count))
+    block = Block("meas", 0, rate_hz, CONTROL_CHANNELS, values, *state.drive.labels(0, count))
     data = LoopCheckData(block, state.drive, profile, rig, {})
     tones = data.tones("table_acc_m_s2")
     return ExpectedResponse(

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from table_io.block import Block, Float1D, Label, join_blocks
+from table_io.channels import CONTROL_CHANNELS
 from table_io.config.base import parse_toml, read_text
 from table_io.config.channel import is_table_channel
 from table_io.config.excitation import History, add_drive_margin, history_acceleration
@@ -19,7 +20,6 @@ from table_io.config.rig_file import load_rig
 from table_io.errors import InputError
 from twin.earthquakes.drive_computation import (
     BAND_EDGE_RATIO,
-    CHANNELS,
     PlayedDrive,
     compute_command,
     correct_played_drive,
@@ -389,7 +389,7 @@ def _simulate_reaction(config: RunConfig, count: int) -> Float1D:
 
 def _read_moving_block(recording: Recording) -> tuple[Block, TableRehearsal]:
     """Return the samples of a recording from rest to rest, and the motion of the table in them."""
-    block = _find_whole_block(recording, CHANNELS[:2])
+    block = _find_whole_block(recording, CONTROL_CHANNELS[:2])
     profile = _read_profile(recording)
     moving = np.flatnonzero(block.label != Label.REST)
     if moving.size == 0:
@@ -399,10 +399,10 @@ def _read_moving_block(recording: Recording) -> tuple[Block, TableRehearsal]:
     last = min(int(moving[-1]) + margin, len(block))
     block = block.cut(block.index + first, block.index + last)
     reaction = _measure_reaction(block, profile)
-    command, displacement = (block.channel(name) for name in CHANNELS[:2])
-    has_accelerometer = CHANNELS[2] in block.channels
+    command, displacement = (block.channel(name) for name in CONTROL_CHANNELS[:2])
+    has_accelerometer = CONTROL_CHANNELS[2] in block.channels
     if has_accelerometer:
-        acceleration = block.channel(CHANNELS[2])
+        acceleration = block.channel(CONTROL_CHANNELS[2])
     else:
         band_hz = 0.0, min(HIGHEST_HZ, MAX_RATE_SHARE * block.rate_hz)
         projection = BandProjection(len(block), block.rate_hz, band_hz)
@@ -430,9 +430,9 @@ def read_played_drive(recording: Recording) -> tuple[Float1D, PlayedDrive]:
         raise InputError("its history was not played to the end", where=recording.path)
     first = whole.index + int(played[0])
     block = whole.cut(first, first + plan.target_m.size)
-    displacement, acceleration = (block.channel(name) for name in CHANNELS[1:])
+    displacement, acceleration = (block.channel(name) for name in CONTROL_CHANNELS[1:])
     resting = whole.cut(whole.index, whole.index + round(NOISE_S * rate_hz))
-    noise_m, noise_m_s2 = (float(resting.channel(name).std()) for name in CHANNELS[1:])
+    noise_m, noise_m_s2 = (float(resting.channel(name).std()) for name in CONTROL_CHANNELS[1:])
     return plan.target_m, PlayedDrive(
         plan.history_m,
         fuse_displacement(displacement, acceleration, rate_hz),
@@ -466,7 +466,7 @@ def _read_profile(recording: Recording) -> Profile:
     return parse_toml(recording.start.profile_toml, Profile, str(recording.path))
 
 
-def _find_whole_block(recording: Recording, needed: Sequence[str] = CHANNELS) -> Block:
+def _find_whole_block(recording: Recording, needed: Sequence[str] = CONTROL_CHANNELS) -> Block:
     """Return the measured samples; InputError if some are missing, or a needed channel."""
     blocks = recording.contiguous_blocks("meas")
     if len(blocks) != 1:
@@ -478,7 +478,7 @@ def _find_whole_block(recording: Recording, needed: Sequence[str] = CHANNELS) ->
     missing = [name for name in needed if name not in blocks[0].channels]
     if missing:
         raise InputError(f"it has no {', '.join(missing)}", where=recording.path)
-    used = [name for name in (*CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]
+    used = [name for name in (*CONTROL_CHANNELS, MASS_CHANNEL) if name in blocks[0].channels]
     for name in used:
         lost = np.flatnonzero(~np.isfinite(blocks[0].channel(name)))
         if lost.size:

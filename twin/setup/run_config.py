@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from table_io.acquisition.session import SessionSetup
 from table_io.backends import open_backend
+from table_io.channels import CONTROL_CHANNELS
 from table_io.clock import ManualClock, local_datetime
 from table_io.config.base import PROFILES_DIR, parse_toml
 from table_io.config.calibration import check_tare, find_overdue_calibrations
@@ -139,7 +140,6 @@ class RunConfig:
         """Return a function that makes the RunStart from tare and epoch."""
 
         def make_start(tare: dict[str, float], epoch_s: float) -> RunStart:
-            table = ("drive_disp_m", "table_disp_m", "table_acc_m_s2")
             return RunStart(
                 index=0,
                 run=run,
@@ -150,7 +150,7 @@ class RunConfig:
                 model_toml=self.model_toml,
                 rate_hz=self.profile.acquisition.rate_hz,
                 block_samples=self.profile.acquisition.block_samples,
-                channels=self.rig.channels if source == "table" else table,
+                channels=self.rig.channels if source == "table" else CONTROL_CHANNELS,
                 steps=self.steps,
                 planned_samples=self.drive.planned_end,
                 tare=tare,
