@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ from table_io.adaptive.continuation import (
 )
 from table_io.config.excitation.continuation import OrbitPlan, PlannedOrbit
 
-A, MASS, DAMPING = 0.49, 550.0, 1100.0
+A, MASS, DAMPING, F_HZ = 0.49, 550.0, 1100.0, 3.4
 FOLD_HZ, FOLD_M, CURVATURE = 4.0, 5e-3, 4.0e4  # f = FOLD_HZ - CURVATURE (|U_1| - FOLD_M)^2
 
 
@@ -61,14 +62,25 @@ def hold(
     return OrbitMeasurement(x, x, c, np.ones(2, dtype=np.complex128))
 
 
-def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
-    f, ratio = 3.4, linear_response(3.4, 200e3)
-    jacobian = real_matrix(ratio)
-    table = table_harmonics(f, A, 1)
+def make_plan(*orbits: PlannedOrbit, **keywords: Any) -> OrbitPlan:
+    return OrbitPlan(harmonics=1, latency_s=0.046, points=orbits, **keywords)
+
+
+def plan_linear_orbit(
+    u_factor: float = 1.0, jacobian_factor: float = 1.0
+) -> tuple[OrbitPlan, np.ndarray, np.ndarray, np.ndarray]:
+    """(plan, Jacobian, harmonics of the table, of u) of an orbit of a linear specimen at F_HZ.
+
+    u and Jacobian of the plan are wrong by the factors.
+    """
+    jacobian, table = real_matrix(linear_response(F_HZ, 200e3)), table_harmonics(F_HZ, A, 1)
     u = jacobian @ table
-    plan = OrbitPlan(
-        harmonics=1, latency_s=0.046, points=(make_orbit(f, 1.1 * complex(u[1], u[2]), jacobian),)
-    )
+    orbit = make_orbit(F_HZ, u_factor * complex(u[1], u[2]), jacobian_factor * jacobian)
+    return make_plan(orbit), jacobian, table, u
+
+
+def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
+    plan, jacobian, table, u = plan_linear_orbit(1.1)
     target = plan_target(plan, 0, ())
     measured = hold(target.reference, u + table, jacobian, 0.5 - 0.3j)
     assert measured.feedback_m > 1e-5
@@ -76,37 +88,24 @@ def test_step_finds_the_orbit_of_a_linear_specimen() -> None:
     np.testing.assert_allclose(measured.x - moved, u + table, atol=1e-12)
     target = correct_target(plan, target, measured)
     np.testing.assert_allclose(target.reference, u + table, atol=1e-12)
-    assert target.frequency_hz == f
+    assert target.frequency_hz == F_HZ
 
 
 def test_step_is_for_the_level_that_the_table_will_have() -> None:
     """The table was 3 % too low while the motion was held."""
-    f, ratio = 3.4, linear_response(3.4, 200e3)
-    jacobian = real_matrix(ratio)
-    table = table_harmonics(f, A, 1)
-    u = jacobian @ table
-    plan = OrbitPlan(
-        harmonics=1, latency_s=0.046, points=(make_orbit(f, complex(u[1], u[2]), jacobian),)
-    )
+    plan, jacobian, table, u = plan_linear_orbit()
     target = plan_target(plan, 0, ())
     measured = hold(target.reference, 0.97 * (u + table), jacobian, 0.5 - 0.3j)
     target = correct_target(plan, target, measured, 0.03 * table)
     np.testing.assert_allclose(target.reference, u + table, atol=1e-12)
-    assert target.frequency_hz == f
+    assert target.frequency_hz == F_HZ
 
 
 def test_broyden_corrects_a_wrong_jacobian() -> None:
-    f, ratio = 3.4, linear_response(3.4, 200e3)
-    table = table_harmonics(f, A, 1)
-    u = real_matrix(ratio) @ table
-    plan = OrbitPlan(
-        harmonics=1,
-        latency_s=0.046,
-        points=(make_orbit(f, 1.1 * complex(u[1], u[2]), real_matrix(1.3 * ratio)),),
-    )
+    plan, jacobian, table, u = plan_linear_orbit(1.1, 1.3)
     target, sizes = plan_target(plan, 0, ()), []
     for _ in range(6):
-        measured = hold(target.reference, u + table, real_matrix(ratio), 0.5 - 0.3j)
+        measured = hold(target.reference, u + table, jacobian, 0.5 - 0.3j)
         sizes.append(measured.feedback_m)
         target = correct_target(plan, target, measured)
     assert sizes[-1] < 0.02 * sizes[0]
@@ -115,12 +114,7 @@ def test_broyden_corrects_a_wrong_jacobian() -> None:
 
 def test_broyden_learns_no_derivative_from_noise() -> None:
     """Changes of 5 um tell the derivative where the feedback is known to 0.1 um, not to 10 um."""
-    f, ratio = 3.4, linear_response(3.4, 200e3)
-    jacobian, table = real_matrix(ratio), table_harmonics(3.4, A, 1)
-    u = jacobian @ table
-    plan = OrbitPlan(
-        harmonics=1, latency_s=0.046, points=(make_orbit(f, complex(u[1], u[2]), jacobian),)
-    )
+    plan, jacobian, table, u = plan_linear_orbit()
     target, shift = plan_target(plan, 0, ()), np.array([0.0, 3e-6, 4e-6])
     first = hold(target.reference, u + table + shift, jacobian, 0.5 - 0.3j)
     errors = []
@@ -138,7 +132,7 @@ def test_phase_resonance_of_a_linear_specimen_is_found_by_the_measured_phase() -
     jacobian = real_matrix(linear_response(start_hz, 200e3))
     planned = jacobian @ table_harmonics(start_hz, A, 1)
     orbit = make_orbit(start_hz, complex(planned[1], planned[2]), jacobian)
-    plan = OrbitPlan(harmonics=1, latency_s=0.046, condition="phase", points=(orbit,))
+    plan = make_plan(orbit, condition="phase")
     target = plan_target(plan, 0, ())
     for _ in range(8):
         response = real_matrix(linear_response(target.frequency_hz, 200e3))
@@ -163,9 +157,7 @@ def branch_orbit(amplitude_m: float) -> PlannedOrbit:
 
 def test_orbits_are_found_past_a_fold_that_lies_lower_than_planned() -> None:
     amplitudes = np.array([4.6e-3, 4.75e-3, 4.9e-3, 5.06e-3, 5.2e-3])
-    plan = OrbitPlan(
-        harmonics=1, latency_s=0.046, points=tuple(branch_orbit(a) for a in amplitudes)
-    )
+    plan = make_plan(*map(branch_orbit, amplitudes))
     shift_hz = -0.05
     for position in (2, 3):
         orbit = plan.points[position]
@@ -186,11 +178,7 @@ def test_orbits_are_found_past_a_fold_that_lies_lower_than_planned() -> None:
 
 
 def test_next_target_continues_what_the_last_orbits_differed_by_across_the_branch() -> None:
-    plan = OrbitPlan(
-        harmonics=1,
-        latency_s=0.046,
-        points=tuple(branch_orbit(a) for a in (4.0e-3, 4.2e-3, 4.4e-3)),
-    )
+    plan = make_plan(*map(branch_orbit, (4.0e-3, 4.2e-3, 4.4e-3)))
     along = planned_reference(plan.points[2]) - planned_reference(plan.points[0])
     along_hz = plan.points[2].frequency_hz - plan.points[0].frequency_hz
     across = np.array([1e-5, 2e-5, 0.0])
@@ -210,7 +198,7 @@ def test_next_target_continues_what_the_last_orbits_differed_by_across_the_branc
 
 
 def test_motion_on_another_branch_is_recognized() -> None:
-    plan = OrbitPlan(harmonics=1, latency_s=0.046, points=(branch_orbit(4.5e-3),))
+    plan = make_plan(branch_orbit(4.5e-3))
     target = plan_target(plan, 0, ())
     u = plan.points[0].harmonics_m
     for factor, expected in ((1.02, True), (1.4, False), (0.5, False)):
