@@ -32,6 +32,7 @@ from twin.results.contract import (
 
 Direction = Literal["forward", "backward"]
 Phase = Literal["flight", "contact_right", "contact_left", ""]
+TwinAgreement = Literal["agrees", "departs", "not judged"]
 NOTHING_MEASURED = "nothing was measured that the twin predicts"  # reason of a verdict
 
 
@@ -208,7 +209,7 @@ class ExcitationVerdict(Contract):
 class TwinVerdict(Contract):
     """Verdict on the twin, apart from that on the test; see `twin.results.twin_verdict`."""
 
-    verdict: Literal["agrees", "departs", "not judged"] = Field(
+    verdict: TwinAgreement = Field(
         description="whether the twin is within its tolerance and jumps where the rig does"
     )
     reason: str = Field(description="what decided it")

@@ -29,7 +29,6 @@ import math
 import shlex
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -60,6 +59,7 @@ from twin.results.contracts import (
     StepBranch,
     StepEntry,
     StepMisfit,
+    TwinAgreement,
     TwinVerdict,
     WorstBranch,
     WorstMisfit,
@@ -73,7 +73,6 @@ MOTION_SENSORS = (
     "rel_disp_m", "mass_disp_m", "mass_acc_m_s2", "table_disp_m", "table_acc_m_s2",
 )  # fmt: skip
 CLIPPING_REACH_S = 1.0  # after which a sensor that was off its range is forgotten
-Verdict = Literal["agrees", "departs", "not judged"]
 PHASES: tuple[Phase, ...] = ("flight", "contact_right", "contact_left")
 DEPARTURE_KIND = "disagreement"  # of warnings
 # Range of eta_d over the cycles, relative to its mean, up to which a motion counts as periodic and
@@ -310,7 +309,7 @@ def judge_twin(summary: RunSummary) -> TwinVerdict:
     planned = _count_planned(summary)
     misfits = _list_misfits(summary)
     misfit = float(np.median(misfits)) if misfits else None
-    verdict: Verdict = "not judged"
+    verdict: TwinAgreement = "not judged"
     if failures and summary.run.source == "model":
         pass
     elif summary.run.source == "model" or not (worst or apart or failures):
@@ -345,7 +344,7 @@ def judge_twin(summary: RunSummary) -> TwinVerdict:
 
 def _judge_agreement(
     summary: RunSummary, judged: int, misfit: float | None
-) -> tuple[Verdict, list[str]]:
+) -> tuple[TwinAgreement, list[str]]:
     """Return the verdict on a twin of which nothing departs, and its reasons."""
     if 2 * judged < len(summary.steps):
         return "not judged", ["too few steps can be judged"]
