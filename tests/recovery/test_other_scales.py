@@ -80,3 +80,12 @@ def test_bumpers_whose_contacts_a_filter_hides_are_not_judged(tmp_path: Path) ->
     assert any("the bumpers are not judged" in note for note in verdict.notes)
     assert not {"bumper_hardening", "hunt_crossley"} & {size.id for size in verdict.excludes}
     assert "filters settle" in verdict.fell_away["bumper_hardening"]
+
+
+def test_a_record_cut_out_of_a_motion_leaves_noise_without_a_mass_accelerometer(
+    tmp_path: Path,
+) -> None:
+    """The noise of the laser's second derivative, cut off sharply, is a force for seconds."""
+    verdict = judge(406, tmp_path).verdict
+    assert verdict.verdict == "none"
+    assert verdict.gap.held_out_after < 1.1

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import convolve1d, maximum_filter1d
 
 from table_io.block import Bool2D, Float1D, Float2D, Int1D, Label
 from table_io.channels import LEFT_CELLS, RIGHT_CELLS
@@ -34,7 +35,7 @@ from twin.discovery.motion import (
 )
 from twin.discovery.noise import number_bands
 from twin.discovery.parameters import SLIP_SPEED, NuisanceKey, ParameterSet
-from twin.discovery.signals import LogSignals, derives_acc
+from twin.discovery.signals import LOST_MARGIN_S, LogSignals, derives_acc
 from twin.model.inverse_dynamics import depends_on_history, forces_along
 from twin.model.model import Model, SensorModel
 
@@ -620,15 +621,31 @@ class LogResiduals:
         places = self._row_places[: len(FORCE_ROWS)]
         rows = [f[place] for f, place in zip(forces, places, strict=True)]
         if self.whitening is not None:
-            # the second derivative at an open end is no force, and the filter would spread it
-            damper = np.where(m.good, forces[0] / self.signals.mass_kg, 0.0)
-            rows[0] = self.signals.grid.apply_gain(damper, self.whitening)[places[0]]
+            rows[0] = self._whiten(forces[0], self.whitening)[places[0]]
         entries = [self._enter_row(row, values) for row, values in enumerate(rows)]
         entries += [self._correct_consistency(c, parameters) for c in sampled.consistency]
         if m.has_load_cells and m.damper is None:
             pulls = self._pull_rows(sampled, parameters, forces)
             entries += [self._enter_row(row, v) for row, v in enumerate(pulls, len(entries))]
         return entries
+
+    def _whiten(self, force_n: Float1D, gain: Float1D) -> Float1D:
+        """Return a force on the mass, (sample,), as an acceleration over its noise."""
+        return self.signals.grid.apply_gain(
+            self._filtered_share * force_n / self.signals.mass_kg, gain
+        )
+
+    @cached_property
+    def _filtered_share(self) -> Float1D:
+        """Share with which samples enter a filter, (sample,): 1 where good, 0 far from it.
+
+        The second derivative at an open end is no force, and the filter, which integrates, would
+        spread it for seconds; as it would what a sharp end cuts off of a displacement's noise.
+        """
+        m = self.motion()
+        fade = np.hanning(round(LOST_MARGIN_S * m.rate_hz) | 1)
+        near = maximum_filter1d(m.good.astype(np.float64), fade.size)
+        return np.asarray(convolve1d(near, fade / fade.sum(), mode="nearest"), dtype=np.float64)
 
     def _enter_row(self, row: int, values: Float1D) -> Float1D:
         """Return the entries of a row over their noise, (entry,), from its samples, (sample,)."""
@@ -768,8 +785,7 @@ class LogResiduals:
         """Return entries over the noise, (entry,), from forces of the three rows, (3, sample)."""
         rows = [values[samples] for values, samples in zip(forces, self._row_samples, strict=False)]
         if self.whitening is not None:
-            whole = np.where(self.motion().good, forces[0] / self.signals.mass_kg, 0.0)
-            rows[0] = self.signals.grid.apply_gain(whole, self.whitening)[self._row_samples[0]]
+            rows[0] = self._whiten(forces[0], self.whitening)[self._row_samples[0]]
         return self._fill_entries(rows)
 
     def _fill_entries(self, rows: Sequence[Float1D]) -> Float1D:
