@@ -5,13 +5,17 @@
 
 latency: from a decision to the first changed sample, and how long the command took to arrive.
 kills: a rig is killed in motion; how soon command and table rest, from the target's black box.
+releases: the same in whole runs of a continuation, each within a release of an orbit; the command
+    against its bound, and whether the recording is whole.
 quickstart: a whole run through `shaketwin table`; lost samples, gaps, blocks on time.
 target: the target is killed in a run; what the rig says, and whether the recording is whole.
 """
 
 import json
 import math
+import os
 import random
+import signal
 import subprocess
 import sys
 import tempfile
@@ -32,6 +36,7 @@ from table_io.config.rig import RigConfig
 from table_io.records import Event
 from tests.builders.flight_records import read_flight_record
 from tests.builders.profiles import UNCHECKED, format_test
+from tests.studies.held_orbits import PROFILE as HELD_PROFILE
 from tests.table_io.backends.udp_bench import (
     SPECIMEN,
     card,
@@ -41,10 +46,12 @@ from tests.table_io.backends.udp_bench import (
     relay_packets,
 )
 from twin.live.process_config import request_realtime
+from twin.setup.run_config import read_run_config
 
 RATE_HZ = 2000.0
 SHAKETWIN = str(Path(sys.executable).parent / "shaketwin")
-DECISIONS, KILLS = 400, 10
+DECISIONS, KILLS, RELEASE_KILLS = 400, 10, 6
+PLATEAU_S = 3.0  # over which the command is that of a held orbit
 STILL_M = 2e-4
 TEST = format_test(1.0, 3.0, 0.5, tables=UNCHECKED)
 
@@ -160,6 +167,83 @@ def kills(folder: Path) -> None:
     print(f"kills: {KILLS}, the longest {max(rests):.2f} s; peak of the command {max(peaks):.4f} g")
 
 
+# Read by every Python process of the run: its rig notes when a release begins.
+RELEASE_HOOK = """
+import sys
+if "twin.live.processes" in sys.orig_argv and "rig" in sys.orig_argv:
+    import table_io.sequencer.orbits as orbits
+    advance_releases = orbits.advance_releases
+    def note(state, block):
+        after = advance_releases(state, block)
+        if after.search.releases.is_released and not state.search.releases.is_released:
+            with open({path!r}, "a") as file:
+                print(block.end, file=file)
+        return after
+    orbits.advance_releases = note
+"""
+
+
+def releases(folder: Path) -> None:
+    """Each rig is killed while the feedback of an orbit is released, pushed or caught again."""
+    chance = random.Random(2)
+    for number in range(RELEASE_KILLS):
+        part = folder / str(number)
+        part.mkdir()
+        profile, released = part / "held.toml", part / "released"
+        values = {"gap": 4.0, "kind": "continuation", "start": 2.75, "stop": 2.9, "level": 0.05}
+        profile.write_text(HELD_PROFILE.format(rig="card.toml", points=2, extra="", **values))
+        (part / "sitecustomize.py").write_text(RELEASE_HOOK.format(path=str(released)))
+        search_path = f"{part}{os.pathsep}{os.environ.get('PYTHONPATH', '')}"
+        command = [SHAKETWIN, "run", str(profile), "--out", str(part / "out")]
+        with (
+            python_target(part, "", "--log", str(part / "box")),
+            subprocess.Popen(command, stdout=-3, env={**os.environ, "PYTHONPATH": search_path})
+            as run,
+        ):  # fmt: skip
+            ratio = find_bound_ratio(profile)
+            due = chance.randint(1, 3)
+            while not released.exists() or len(released.read_text().split()) < due:
+                time.sleep(0.02)
+                assert run.poll() is None, "the run has ended before the release"
+            delay_s = chance.uniform(0.0, 1.2)
+            time.sleep(delay_s)
+            at = time.monotonic()
+            os.kill(find_component(run.pid, "rig"), signal.SIGKILL)
+            code = run.wait()
+            time.sleep(3.0)
+        (life,) = read_flight_record(part / "box")
+        killed, drive = round((at - life.epoch_s) * RATE_HZ), life.command_m
+        acceleration = np.diff(drive, 2) * RATE_HZ**2
+        window = round(PLATEAU_S * RATE_HZ)
+        power = np.convolve(acceleration**2, np.full(window, 1.0 / window), "valid")
+        peak = np.abs(acceleration).max() / math.sqrt(2.0 * power.max())
+        rest_s = (np.flatnonzero(np.abs(drive) > 1e-6)[-1] - killed) / RATE_HZ
+        verify = [SHAKETWIN, "verify", str(part / "out" / "run.mcap")]
+        verified = subprocess.run(verify, stdout=subprocess.PIPE, text=True, check=False)
+        summary = json.loads((part / "out" / "summary.json").read_text())
+        print(
+            f"releases: {delay_s:.2f} s into release {due}, exit {code}: command at rest "
+            f"{rest_s:.2f} s after, peak {peak:.3f} of the plateau, bound {ratio:.3f}; "
+            f"{summary['verdict']}, gaps {summary['gaps']}; verify exit {verified.returncode}, "
+            f"{'hash matches' if 'matches its hash' in verified.stdout else verified.stdout}",
+            flush=True,
+        )
+        assert drive[-1] == 0.0, "the command rests at its mean"
+
+
+def find_bound_ratio(profile: Path) -> float:
+    """Return what `check` states: the largest acceleration of the command over the level."""
+    config = read_run_config(profile)
+    peak_m_s2 = max(row.acceleration_m_s2 for row in config.margins if row.step >= 0)
+    return peak_m_s2 / config.profile.plan.level_m_s2
+
+
+def find_component(run: int, component: str) -> int:
+    """Return the process id of a component of a run."""
+    pattern = ["pgrep", "-P", str(run), "-f", f"processes {component}"]
+    return int(subprocess.run(pattern, capture_output=True, text=True, check=True).stdout)
+
+
 def quickstart(folder: Path) -> None:
     """A whole run, in real time."""
     with python_target(folder, ""):
@@ -213,7 +297,7 @@ def main() -> None:
     if sys.argv[1:2] == ["drive"]:
         drive(*sys.argv[2:])
         return
-    studies = {study.__name__: study for study in (latency, kills, quickstart, target)}
+    studies = {study.__name__: study for study in (latency, kills, releases, quickstart, target)}
     for name in sys.argv[1:] or studies:
         with tempfile.TemporaryDirectory() as folder:
             studies[name](Path(folder))
