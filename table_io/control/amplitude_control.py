@@ -66,7 +66,9 @@ class Tuning:
         """Return a target with a correction of its command, within its limits."""
         largest = self.max_correction
         if self.find_room is not None:
-            largest = min(largest, self.find_room(target.frequency_hz, target.level_m_s2))
+            # Never below 1: a command that is not corrected is refused before motion, not lowered.
+            room = max(1.0, self.find_room(target.frequency_hz, target.level_m_s2))
+            largest = min(largest, room)
         clamped = float(np.clip(correction, 1.0 / self.max_correction, largest))
         return replace(target, correction=clamped)
 

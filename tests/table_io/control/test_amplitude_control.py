@@ -227,6 +227,7 @@ def test_every_gain_that_a_rig_accepts_can_be_corrected(
         (0.5, {}, 60e-3 / (A / np.pi**2)),
         (2.0, {"velocity_mm_s": 50.0}, 50e-3 / (A / (4 * np.pi))),
         (5.0, {"acceleration_g": 0.06}, 1.2),
+        (5.0, {"acceleration_g": 0.04}, 1.0),  # refused before motion, not lowered
         (5.0, {}, 5.0),  # by the gains that the rig accepts
     ],
 )
