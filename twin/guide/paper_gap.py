@@ -9,9 +9,9 @@ from pathlib import Path
 
 from typer.core import TyperGroup
 
-from twin.discovery.result import FeatureVerdict, label_feature, name_fit
-from twin.discovery.words import format_interval
+from twin.discovery.result import FeatureVerdict, Interval, label_feature, name_fit
 from twin.guide.reference import format_table
+from twin.results.quantities import format_quantity
 
 RESULT_FILE = Path(__file__).with_name("paper_features.json")
 MAX_FITS = 8  # of the ranking
@@ -39,7 +39,7 @@ def write_paper_gap(_: TyperGroup) -> str:
             f"## The best model: {name}",
             format_table(
                 ("parameter", "value, with half of its 95 % interval"),
-                ((key, format_interval(value)) for key, value in best.parameters.items()),
+                ((key, _format_value(value)) for key, value in best.parameters.items()),
             ),
             "A tolerance is read as two standard deviations; without an interval the features do "
             "not bound the value. `paper_hysteresis` in `profiles/models` is its model file, "
@@ -90,3 +90,7 @@ def _list_features(content: FeatureVerdict, numbers: Iterable[int]) -> str:
     entries = [content.features[number] for number in numbers]
     lines = [f"* {label_feature(entry)}; predicted: {entry.best.text}" for entry in entries]
     return "\n".join(lines) or "Nothing."
+
+
+def _format_value(value: Interval) -> str:
+    return format_quantity(value.value, value.unit, value.half_width)
