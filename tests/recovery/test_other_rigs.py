@@ -105,10 +105,10 @@ def test_one_frequency_is_read_from_the_drive() -> None:
     time = np.arange(block.values.shape[1]) / block.rate_hz
     noise = 0.01 * np.random.default_rng(0).standard_normal(time.size)
     sine, other = np.sin(2 * math.pi * 1.3 * time), np.sin(2 * math.pi * 2.1 * time)
-    one, two = with_drive(sine + noise).signals, with_drive(other + noise).signals
-    assert has_single_frequency([one])
-    assert has_single_frequency([one, one])
-    assert not has_single_frequency([one, two])
+    slow, fast = with_drive(sine + noise).signals, with_drive(other + noise).signals
+    assert has_single_frequency([slow])
+    assert has_single_frequency([slow, slow])
+    assert not has_single_frequency([slow, fast])
     assert not has_single_frequency([with_drive(np.where(time < 16, sine, other)).signals])
     assert not has_single_frequency([prepare(block, Hidden()).signals])
-    assert not has_single_frequency([one, prepare(block, Hidden()).signals])
+    assert not has_single_frequency([slow, prepare(block, Hidden()).signals])
