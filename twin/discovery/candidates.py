@@ -109,8 +109,8 @@ def list_candidates(
     log_residuals: Sequence[LogResiduals], fitted: ParameterSet, without: Sequence[str] = ()
 ) -> tuple[tuple[Candidate, ...], dict[str, str]]:
     """Return (candidates not yet in the parameter set, reason for each excluded effect)."""
-    hidden = {residuals.explain_hidden_bumpers() for residuals in log_residuals}
-    reason_in_bumpers = "" if "" in hidden else max(hidden)
+    hidden = [residuals.explain_hidden_bumpers() for residuals in log_residuals]
+    reason_in_bumpers = "; ".join(dict.fromkeys(hidden)) if all(hidden) else ""
     channels = set.intersection(*(set(residuals.signals.channels) for residuals in log_residuals))
     candidates, excluded = [], {}
     for effect in (*EFFECTS, *load_plugins()):

@@ -161,7 +161,7 @@ def prepare_problem(
         for residuals in log_residuals
         if (reason := residuals.explain_hidden_bumpers()) and residuals.contact_state.any()
     ]
-    if has_single_frequency([signals for signals, _ in pairs]):
+    if has_single_frequency([log.signals for log in logs]):
         notes.append(
             "only one frequency: damping, lag, relaxation and hysteresis cannot be distinguished"
         )

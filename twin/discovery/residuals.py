@@ -640,7 +640,8 @@ class LogResiduals:
         """Share with which samples enter a filter, (sample,): 1 where good, 0 far from it.
 
         The second derivative at an open end is no force, and the filter, which integrates, would
-        spread it for seconds; as it would what a sharp end cuts off of a displacement's noise.
+        spread it for seconds; as it would what a sharp end cuts off of a displacement's noise. So
+        the share falls within the least margin that is excluded around what is not good.
         """
         m = self.motion()
         fade = np.hanning(round(LOST_MARGIN_S * m.rate_hz) | 1)
