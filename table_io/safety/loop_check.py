@@ -139,6 +139,11 @@ def check_read_back(data: LoopCheckData) -> Iterator[Check]:
     )
 
 
+def _widen_gains(low: float, high: float, noise: float) -> tuple[float, float]:
+    """Return a range of gains with what noise may change of one; no gain is below zero."""
+    return max(low - noise, 0.0), high + noise
+
+
 def check_table_response(data: LoopCheckData) -> Iterator[Check]:
     """Check polarity, gain and delay of the table's sensors against the command.
 
@@ -165,14 +170,15 @@ def check_table_response(data: LoopCheckData) -> Iterator[Check]:
         polarity = float(np.cos(np.angle(tones[0])))
         yield make_check(data, "polarity against the command", name, polarity, 0.0, 1.0, "")
         least_gain = allowed.find_least_gain(float(frequencies_hz[0])) if is_stated else 0.0
-        gain_range = least_gain - noise[0], allowed.gain[1] + noise[0]
+        gain_range = _widen_gains(least_gain, allowed.gain[1], noise[0])
         yield make_check(data, "gain", name, abs(tones[0]), *gain_range, "")
         swept = np.flatnonzero(frequencies_hz <= data.profile.plan.high_hz * (1 + 1e-9))
         if swept.size > 1:
             top = swept[-1]
-            top_gain, least_gain = abs(tones[top]), allowed.top_gain[0] if is_stated else 0.0
-            top_range = least_gain - noise[top], allowed.top_gain[1] + noise[top]
-            yield make_check(data, "gain at the highest frequency", name, top_gain, *top_range, "")
+            least_gain = allowed.top_gain[0] if is_stated else 0.0
+            top_range = _widen_gains(least_gain, allowed.top_gain[1], noise[top])
+            label, top_gain = "gain at the highest frequency", abs(tones[top])
+            yield make_check(data, label, name, top_gain, *top_range, "")
         if expected is not None or swept.size > 2:
             label, logarithms = "gain off that of the drive", np.log(np.abs(ratios))
             if expected is None:
