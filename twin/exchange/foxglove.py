@@ -105,7 +105,7 @@ def _iter_samples(
     """Yield one message per sample and topic."""
     first = 0
     for window in rows.iter_windows():
-        index = rows.sample_index(slice(first, first + WINDOW_ROWS))
+        index = rows.index[first : first + WINDOW_ROWS]
         first += index.size
         payloads_by_topic = {
             topic: _pack_rows(index, clock, window, topic_fields)

@@ -45,7 +45,7 @@ def compute_spectrograms(
     log that is shorter than a window.
     """
     rate_hz = rows.start.rate_hz
-    index = rows.sample_index(slice(None))
+    index = rows.index
     index -= index[0]
     size = round(SPECTRUM_WINDOW_S * rate_hz)
     if size < 2 or index[-1] < size:

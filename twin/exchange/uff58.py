@@ -26,7 +26,7 @@ Axis = tuple[int, str, str]  # code of the quantity, its name and unit
 def write_uff58(rows: LogTable, path: Path) -> None:
     """Write the channels of a log over time, and their frequency responses."""
     start = rows.start
-    index = rows.sample_index(slice(None))
+    index = rows.index
     first, step_s = int(index[0]), 1.0 / start.rate_hz
     texts = [f"shaketwin {start.run}", start.started_at or "NONE", start.name, "NONE"]
     with path.open("wb") as file:

@@ -24,10 +24,7 @@ from table_io.channels import (
 from table_io.config.channel import read_channels
 from table_io.errors import InputError
 from table_io.records import Event, PrcPoint, Record, RunStart, RunStop, Step, StepAdded
-from twin.recording.reader import (
-    Recording,
-    read_recording,
-)
+from twin.recording.reader import Recording, read_recording
 from twin.transport.codec import RECORD_TOPICS, Item
 from twin.transport.endpoint import MEAS_TOPIC, PRED_TOPIC
 
@@ -104,10 +101,6 @@ class LogTable:
                 sources = (series[MEAS_TOPIC].pick(each, index) for each in RELATIVE_DISP_SOURCES)
                 columns[name] = np.subtract(*sources)
         return {name: columns[name] for name in only or self.units}
-
-    def sample_index(self, rows: slice) -> Int1D:
-        """Return the sample index of a slice of rows, (row,)."""
-        return self.index[rows]
 
     def select(self, channels: tuple[str, ...], steps: tuple[int, int] | None) -> "LogTable":
         """Select `channels` and the samples of `steps` (first, last); empty or None selects all."""
