@@ -147,7 +147,7 @@ def _complete_link(link: ChainLink, verdict: Verdict) -> ChainLink:
 def measure_minutes(run_folder: Path) -> float:
     """Return how long the table was played in a run in min, to its end or stop."""
     recording = open_recording(run_folder)
-    return max(item.end for item in recording.blocks("meas")) / recording.start.rate_hz / 60.0
+    return recording.contiguous_blocks("meas")[-1].end / recording.start.rate_hz / 60.0
 
 
 def find_end(result: DiscoveredModel, count: int, remaining_min: float) -> str:

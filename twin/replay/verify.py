@@ -192,7 +192,7 @@ def examine_logs(paths: list[Path], unmerged: Sequence[str] = ()) -> Verificatio
         ),
         predictions=PredictionCount(
             max(start.predictions_every, 1),
-            sum(map(len, recording.blocks("pred"))),
+            sum(map(len, recording.contiguous_blocks("pred"))),
             sum(entry.count for entry in recording.records(PredictionHash)),
         ),
         gaps=gaps,
@@ -259,7 +259,7 @@ def assess_replay(recording: Recording) -> ReplayOutlook:
     try:
         if "table_acc_m_s2" not in recording.start.channels:
             raise InputError("no channel table_acc_m_s2, which drives the twin")
-        if not recording.blocks("meas"):
+        if not recording.contiguous_blocks("meas"):
             raise InputError("no measured samples")
         read_recorded_config(recording)
     except InputError as error:

@@ -85,11 +85,6 @@ class ReportData:
         has_twin = self.source == "twin" and self.recording.contiguous_blocks("pred")
         return "pred" if has_twin else "meas"
 
-    @property
-    def shown_blocks(self) -> tuple[Block, ...]:
-        """Stream of an overview, joined between gaps."""
-        return self.recording.contiguous_blocks(self.shown_stream)
-
     def read_stream(self, stream: str, first: int, end: int) -> list[Block]:
         """Return samples first .. end - 1 of "meas" or "pred"; unrecorded ones are recomputed."""
         if stream == "meas":
@@ -334,7 +329,7 @@ def pair_motions(
 
 
 def compute_envelopes(run: ReportData) -> dict[str, list[Envelope]]:
-    """Return the envelopes of the shown blocks by row of the overview, without rows of no data."""
+    """Return the envelopes of the shown stream by row of the overview, without rows of no data."""
     prefix = "" if run.source == "measured" else "free/"
 
     def get_channel(block: Block, channel: str) -> Float1D:
@@ -350,7 +345,7 @@ def compute_envelopes(run: ReportData) -> dict[str, list[Envelope]]:
     }
     envelopes: dict[str, list[Envelope]] = {label: [] for label in rows}
     low_hz = min((step.frequency_hz for step in run.steps), default=1.0)
-    for block in run.shown_blocks:
+    for block in run.recording.contiguous_blocks(run.shown_stream):
         # Bins of at least one cycle, as many in each piece as it holds.
         width = max(len(block) // MAX_ENVELOPE_BINS, round(block.rate_hz / low_hz), 1)
         samples = width * max(PIECE_SAMPLES // width, 1)
