@@ -125,6 +125,16 @@ def test_copies_of_the_null_are_named_no_more_often_than_stated() -> None:
         assert np.sum(np.array(probabilities) < share) <= binom.isf(0.001, copies, share)
 
 
+def test_chance_is_named_no_more_often_than_stated() -> None:
+    """Of 200 recordings of noise, few give any set more evidence than none."""
+    columns = draw(8, 5)
+    more = sum(
+        build(columns, draw(1, 100 + seed)[0]).rank_states(2)[0].columns != ()
+        for seed in range(200)
+    )
+    assert more <= 4
+
+
 def test_a_column_that_is_noise_explains_nothing() -> None:
     """Its products with a residual of the same noise are large: on average by what is taken off."""
     noise = draw(1, 6)[0]
