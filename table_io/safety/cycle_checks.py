@@ -225,14 +225,18 @@ def check_sensor_pair(
 
 
 def check_table_mean(cycle: DriveCycle) -> Iterator[Suspicion]:
-    """Check that the mean of the table's displacement over a held cycle is that at rest."""
+    """Check that the mean of the table's displacement over a held cycle is that of its command.
+
+    The command has one while a feedback changes it within the cycle.
+    """
     if not cycle.has("table_disp_m"):
         return
     table = cycle.tones["table_disp_m"]
     limit = OFFSET_RANGE_RATIO * cycle.context.range_si("table_disp_m")
     limit += OFFSET_AMPLITUDE_RATIO * table.fundamental + cycle.sigma("table_disp_m")
-    if abs(table.offset) > limit:
-        yield suspect_drift("table_disp_m", table.offset, limit, "m")
+    drift = table.offset - cycle.tones["command"].offset
+    if abs(drift) > limit:
+        yield suspect_drift("table_disp_m", drift, limit, "m")
 
 
 @dataclass(frozen=True, slots=True)

@@ -174,12 +174,24 @@ def test_check_command_gain_at_its_limit(edge: Edge, command_m: float) -> None:
         assert not list(cycle_checks.check_command_gain(other))
 
 
-@given(edge=EDGES, amplitude_m=st.floats(0.0, 0.05), sigma=st.floats(0.0, 1e-4))
+@given(
+    edge=EDGES,
+    amplitude_m=st.floats(0.0, 0.05),
+    sigma=st.floats(0.0, 1e-4),
+    command_mean_m=st.sampled_from([0.0, -1e-3, 1e-3]),
+)
 @MANY
-def test_check_table_mean_at_its_limit(edge: Edge, amplitude_m: float, sigma: float) -> None:
+def test_check_table_mean_at_its_limit(
+    edge: Edge, amplitude_m: float, sigma: float, command_mean_m: float
+) -> None:
+    """A command that has a mean, as a feedback that changes within the cycle, moves the table."""
     limit = 0.075e-3 + 0.02 * amplitude_m + sigma
     mean = edge.signed_factor * limit
-    cycle = make_cycle({"table_disp_m": amplitude_m * WAVE + mean}, sigma={"table_disp_m": sigma})
+    cycle = make_cycle(
+        {"table_disp_m": amplitude_m * WAVE + command_mean_m + mean},
+        sigma={"table_disp_m": sigma},
+        command=amplitude_m * WAVE + command_mean_m,
+    )
     suspicions = list(cycle_checks.check_table_mean(cycle))
     require_suspicion(suspicions, edge.is_beyond, "drift", "table_disp_m", mean, limit)
     assert not list(cycle_checks.check_table_mean(make_cycle({"table_disp_m": math.nan})))
