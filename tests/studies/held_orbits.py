@@ -2,14 +2,15 @@
 
     python -m tests.studies.held_orbits starts --count 40     start_hz over 2.75 to 4.1 Hz, two rigs
     python -m tests.studies.held_orbits bounds --count 20     profiles, on each of three rigs
-    python -m tests.studies.held_orbits stops --count 60      stop and abort at random samples
-    python -m tests.studies.held_orbits releases --count 30   the same, within a release
+    python -m tests.studies.held_orbits stops --count 20      at random samples, on three rigs
+    python -m tests.studies.held_orbits releases --count 20   the same, within a release
 
 The command is read where it is written to the rig, so its acceleration is exact.
 """
 
 import argparse
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -97,7 +98,7 @@ def play(
 
     backend.queue = record  # type: ignore[method-assign]
     progress = [0]  # samples so far
-    accepted, stop, is_whole, held_m_s2 = 0, None, True, [0.0]
+    accepted, stop, is_whole, held_m_s2 = 0, None, True, list[float]()
     rejections: list[str] = []
 
     def hold(*arguments: Any) -> ReferenceSegment:
@@ -133,7 +134,7 @@ def play(
     command_m = written[:samples] * rig.output.span_mm * 1e-3 / rig.output.span_v
     return HeldTest(
         accepted, len(orbits), stop.verdict, stop.reason, command_m, config.drive.rate_hz,
-        level_m_s2, max(held_m_s2), bound_m_s2 / level_m_s2,
+        level_m_s2, max(held_m_s2, default=level_m_s2), bound_m_s2 / level_m_s2,
         is_whole and stop.index == samples, tuple(rejections),
     )  # fmt: skip
 
@@ -171,7 +172,7 @@ def try_starts(folder: Path, count: int, points: int) -> None:
     print(f"{reached} reached, {refused} refused before motion, of {2 * count}")
 
 
-def try_bounds(folder: Path, count: int, seed: int) -> None:
+def try_bounds(folder: Path, count: int, seed: int, span_hz: float) -> None:
     rng, ratios, above = np.random.default_rng(seed), [], 0
     for index in range(count):
         kind = "backbone" if index % 3 == 2 else "continuation"
@@ -182,7 +183,7 @@ def try_bounds(folder: Path, count: int, seed: int) -> None:
             keys |= {"start": 1.3, "stop": 4.5, "extra": f"min_acceleration_g = {0.6 * level:.4f}"}
         else:  # a part of the branch
             start = round(float(rng.uniform(2.6, 3.4)), 2)
-            keys |= {"start": start, "stop": start + 0.2, "extra": "multiplier_periods = 16"}
+            keys |= {"start": start, "stop": start + span_hz, "extra": "multiplier_periods = 16"}
         for rig in RIGS:
             try:
                 config = read(folder, rig, **keys)
@@ -197,44 +198,37 @@ def try_bounds(folder: Path, count: int, seed: int) -> None:
                 f"bound {ratios[-1]:.3f} of the plateau, which is "
                 f"{test.plateau_m_s2 / test.level_m_s2:.3f} of the level, "
                 f"{test.accepted} of {test.planned}, {test.verdict}",
-                *test.rejections, sep="\n    ", flush=True,
+                *((test.reason,) if test.verdict == "aborted" else ()), *test.rejections,
+                sep="\n    ", flush=True,
             )  # fmt: skip
     print(f"{len(ratios)} played, {above} above the bound, bound at most {max(ratios):.3f}")
 
 
-def try_stops(folder: Path, count: int, seed: int) -> None:
-    rng, bad = np.random.default_rng(seed), 0
-    config = read(folder, points=3)
-    for index in range(count):
-        at_s, name = float(rng.uniform(8.0, 90.0)), ("stop", "abort")[index % 2]
-        asked: list[int] = []
+@dataclass(frozen=True)
+class StopRequest:
+    """Stop or abort, so many seconds after the first sample, or into a release of the feedback."""
 
-        def operate(end: int, at_s: float = at_s, name: str = name, asked: list[int] = asked
-                    ) -> OperatorCommand | None:  # fmt: skip
-            if end < at_s * config.drive.rate_hz or asked:
-                return None
-            asked.append(end)
-            return OperatorCommand(name, "study")
+    name: str
+    delay_s: float
+    release: int = 0  # its number, from 1 on
 
-        test = play(config, operate)
-        since = asked[0] if asked else test.command_m.size
-        is_good = test.rests(5.0, since) and test.peak_ratio <= test.bound_ratio and test.is_whole
-        bad += not is_good
-        print(
-            f"{index:>3} {name} at {at_s:.2f} s: {'good' if is_good else 'WRONG'}, peak "
-            f"{test.peak_ratio / test.bound_ratio:.3f} of the bound, {test.verdict}",
-            flush=True,
-        )
-    print(f"{bad} of {count} wrong")
+    def is_due(self, end: int, released: Sequence[int], rate_hz: float) -> bool:
+        """Return whether it is due at sample `end`; released: at which releases began."""
+        if self.release > len(released):
+            return False
+        since = released[self.release - 1] if self.release else 0
+        return end >= since + self.delay_s * rate_hz
 
 
-def try_stops_in_releases(folder: Path, count: int, seed: int) -> None:
-    """Stop and abort while the feedback of an orbit is released, pushed or caught again."""
-    rng, bad, within = np.random.default_rng(seed), 0, 0
-    config = read(folder, points=3)
-    for index in range(count):
-        name, released = ("stop", "abort")[index % 2], list[int]()
-        number, delay_s = int(rng.integers(1, 5)), float(rng.uniform(0.0, 1.5))
+def try_stops(folder: Path, requests: Sequence[StopRequest]) -> None:
+    """Stop one and the same test at each of the requests, on each rig.
+
+    The test is played once: at each request the process divides, and its copy plays the stop.
+    """
+    asked, bad = 0, 0
+    for rig in RIGS:
+        config = read(folder, rig, points=3)
+        pending, own, released = list(requests), list[tuple[StopRequest, int]](), list[int]()
 
         def note(
             state: SequencerState, block: Block, released: list[int] = released
@@ -248,31 +242,59 @@ def try_stops_in_releases(folder: Path, count: int, seed: int) -> None:
                 released.append(block.end)
             return replace(state, search=after)
 
-        asked: list[int] = []
-
         def operate(
-            end: int, number: int = number, delay_s: float = delay_s, name: str = name,
-            released: list[int] = released, asked: list[int] = asked,
+            end: int, config: RunConfig = config, pending: list[StopRequest] = pending,
+            own: list[tuple[StopRequest, int]] = own, released: list[int] = released,
         ) -> OperatorCommand | None:  # fmt: skip
-            due = len(released) >= number
-            if asked or not due or end < released[number - 1] + delay_s * config.drive.rate_hz:
+            nonlocal asked, bad
+            if own:
                 return None
-            asked.append(end)
-            return OperatorCommand(name, "study")
+            for request in tuple(pending):
+                if request.is_due(end, released, config.drive.rate_hz):
+                    pending.remove(request)
+                    asked += 1
+                    process = os.fork()
+                    if not process:
+                        own.append((request, end))
+                        return OperatorCommand(request.name, "study")
+                    bad += os.waitpid(process, 0)[1] != 0
+            return None if pending else OperatorCommand("stop", "study")
 
-        with patch("table_io.sequencer.orbits.advance_releases", note):
-            test = play(config, operate)
-        within += bool(asked)
-        since = asked[0] if asked else test.command_m.size
-        is_good = test.rests(5.0, since) and test.peak_ratio <= test.bound_ratio and test.is_whole
-        bad += not is_good
-        print(
-            f"{index:>3} {name} {delay_s:.2f} s into release {number} of "
-            f"{len(released)}: {'good' if is_good else 'WRONG'}, peak "
-            f"{test.peak_ratio / test.bound_ratio:.3f} of the bound, {test.verdict}",
-            flush=True,
-        )
-    print(f"{bad} of {count} wrong, {within} asked within a release")
+        is_good = False
+        try:
+            with patch("table_io.sequencer.orbits.advance_releases", note):
+                test = play(config, operate)
+            if own:
+                ((request, since),) = own
+                is_good = (
+                    test.rests(5.0, since) and test.peak_ratio <= test.bound_ratio and test.is_whole
+                )
+                print(
+                    f"{rig} {request.name} at {since / config.drive.rate_hz:.2f} s, release "
+                    f"{len(released)}: {'good' if is_good else 'WRONG'}, peak "
+                    f"{test.peak_ratio / test.bound_ratio:.3f} of the bound, {test.verdict}",
+                    flush=True,
+                )
+        finally:
+            if own:  # a copy
+                os._exit(not is_good)
+    print(f"{bad} of {asked} wrong")
+
+
+def draw_stops(count: int, seed: int) -> list[StopRequest]:
+    rng = np.random.default_rng(seed)
+    return [
+        StopRequest(("stop", "abort")[k % 2], float(rng.uniform(16.0, 120.0))) for k in range(count)
+    ]
+
+
+def draw_stops_in_releases(count: int, seed: int) -> list[StopRequest]:
+    """Draw stops while the feedback of an orbit is released, pushed or caught again."""
+    rng = np.random.default_rng(seed)
+    return [
+        StopRequest(("stop", "abort")[k % 2], float(rng.uniform(0.0, 1.5)), int(rng.integers(1, 5)))
+        for k in range(count)
+    ]
 
 
 def main() -> None:
@@ -281,16 +303,17 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=20)
     parser.add_argument("--points", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--span-hz", type=float, default=0.2, help="of a continuation's bounds")
     options = parser.parse_args()
     with TemporaryDirectory() as name:
         if options.what == "starts":
             try_starts(Path(name), options.count, options.points)
         elif options.what == "bounds":
-            try_bounds(Path(name), options.count, options.seed)
+            try_bounds(Path(name), options.count, options.seed, options.span_hz)
         elif options.what == "stops":
-            try_stops(Path(name), options.count, options.seed)
+            try_stops(Path(name), draw_stops(options.count, options.seed))
         else:
-            try_stops_in_releases(Path(name), options.count, options.seed)
+            try_stops(Path(name), draw_stops_in_releases(options.count, options.seed))
 
 
 if __name__ == "__main__":
