@@ -1,6 +1,7 @@
 """A table of samples becomes a log: what our own run says of itself comes out of its CSV again."""
 
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -351,7 +352,8 @@ def test_import_table_of_an_earthquake_has_no_steps(tmp_path: Path) -> None:
     recording = read_recording(log)
     block = whole(recording)
     assert block.rate_hz == 200.0
-    assert block.channel("rel_disp_m")[0] == -9.43853e-05
+    u = np.genfromtxt(DATA / "bncs/CNP100.csv", delimiter=",", names=True)["rel_disp_m"]
+    assert block.channel("rel_disp_m") - block.channel("rel_disp_m")[0] == pytest.approx(u - u[0])
     assert set(block.step) == {-1}
     assert set(block.label) == {Label.REST, Label.SETTLE}
     assert "no stepped sine" in read_warnings(recording)
@@ -366,6 +368,39 @@ def test_import_table_of_the_silverbox_by_a_map(tmp_path: Path) -> None:
     assert import_table(file, log, ImportOptions(columns=tmp_path / "map.toml")).gaps == 0
     block = whole(read_recording(log))
     assert (block.rate_hz, len(block)) == (610.35, 20_000)
-    assert block.channel("table_acc_m_s2")[0] == -0.0057756
-    assert block.channel("rel_disp_m")[0] == 0.0093978
+    acc, u = block.channel("table_acc_m_s2"), block.channel("rel_disp_m")
+    first, second = (float(line.split(",")[0]) for line in lines[1:3])
+    assert acc[1] - acc[0] == pytest.approx(first - second)  # gain -1
+    still = block.label == Label.REST
+    assert [acc[still].mean(), u[still].mean()] == pytest.approx([0.0, 0.0], abs=1e-12)
     assert set(block.step) == {-1}
+
+
+def test_a_table_is_tared_where_it_is_still_unless_bumpers_press(
+    run: tuple[Path, Recording], tmp_path: Path
+) -> None:
+    """A laser or load cell of others has any zero; one that is pressed at rest has none."""
+    zeros = {"mass_disp_m": 2e-4, "mass_acc_m_s2": -0.03, "force_r1_n": 4.0}
+    header, *lines = (run[0] / "table.csv").read_text().splitlines()
+    rows = np.array([line.split(",") for line in lines], dtype=np.float64)
+    rows += [zeros.get(name, 0.0) for name in header.split(",")]
+    file = tmp_path / "table.csv"
+    np.savetxt(file, rows, fmt="%.9g", delimiter=",", header=header, comments="")
+    known = whole(run[1])
+    at_rest = slice(0, np.flatnonzero(known.label != Label.REST)[0])
+    for number, (gap, is_tared) in enumerate(((None, True), ("gap_mm = -1.0", False))):
+        text = (run[0] / "quick.toml").read_text()
+        (tmp_path / f"{number}.toml").write_text(
+            text if gap is None else re.sub("gap_mm = .*", gap, text)
+        )
+        log = tmp_path / f"{number}.mcap"
+        options = ImportOptions(profile=tmp_path / f"{number}.toml")
+        notes = "; ".join(import_table(file, log, options).notes)
+        block = whole(read_recording(log))
+        for name, zero in zeros.items():
+            ours, theirs = block.channel(name), known.channel(name)
+            left = ours - theirs
+            assert left == pytest.approx(
+                np.full(left.size, -theirs[at_rest].mean() if is_tared else zero), abs=1e-6
+            )
+            assert (f"{name} by" in notes) is is_tared

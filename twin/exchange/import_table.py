@@ -49,6 +49,7 @@ MOTION_CHANNELS = (
 )  # steps are detected in the first one present
 NO_REST = "nothing is taken as rest: no channel has a zero, noise is taken from the motion"
 MAX_REST_SHARE = 0.1  # of the range of the motion, by which a channel may be off zero at rest
+MIN_ZERO_ERRORS = 4.0  # of its standard errors, from which a zero at rest is taken off
 MAX_COUNT = 10**6  # of steps, and of cycles in a step
 MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
 MAX_GAPS = 1000  # per channel: beyond, lost samples are only counted
@@ -214,13 +215,16 @@ def import_table(
     labels = file_labels or _detect_labels(grid, config, on_grid=options.profile is not None)
     is_rest = column_map.rest if column_map is not None else None
     labels = _judge_rest(grid, labels, is_rest, is_component=options.profile is None)
+    tared: tuple[str, ...] = ()
+    if config.profile.specimen.gap_mm > 0 and not _has_config_texts(table):
+        grid, tared = _tare(grid, labels)
     is_history = not labels.steps and bool((labels.step >= 0).any())
     is_plain = options.profile is None and not _has_config_texts(table)
     # the steps of a placeholder's sweep were never played
     steps = labels.steps or (() if is_history or is_plain else config.steps)
     config = replace(config, drive=replace(config.drive, steps=steps))
     missing_profile = (NO_PROFILE.format(**specimen.describe()),) if is_plain else ()
-    notes = (*missing_profile, *samples.notes, *labels.messages, _describe_steps(labels))
+    notes = (*missing_profile, *samples.notes, *labels.messages, *tared, _describe_steps(labels))
     run = make_run_id(file.stem)
     start = replace(
         config.make_start_factory(run, "table")({}, 0.0),
@@ -345,15 +349,42 @@ def _measure_rest_offsets(grid: _SampleGrid, labels: DetectedSteps) -> dict[str,
     """Return the mean of each channel that is far from zero in the still beginning, in SI."""
     moving = np.flatnonzero(labels.label != Label.REST)
     offsets: dict[str, float] = {}
-    if not moving.size or not moving[0]:
-        return offsets
-    for name, values in zip(grid.channels, grid.values, strict=True):
-        rest, motion = values[: moving[0]], values[moving[0] : moving[-1] + 1]
-        if np.isfinite(rest).any() and np.isfinite(motion).any():
-            offset = float(np.nanmean(rest))
+    for name, offset, _ in _measure_rest(grid, labels):
+        motion = grid.values[grid.channels.index(name), moving[0] : moving[-1] + 1]
+        if np.isfinite(motion).any():
             if abs(offset) > MAX_REST_SHARE * float(np.nanmax(motion) - np.nanmin(motion)):
                 offsets[name] = offset
     return offsets
+
+
+def _measure_rest(
+    grid: _SampleGrid, labels: DetectedSteps
+) -> Iterator[tuple[str, float, float]]:
+    """Yield (channel, mean, its standard error if noise is white) in the still beginning, in SI."""
+    moving = np.flatnonzero(labels.label != Label.REST)
+    for name, values in zip(grid.channels, grid.values, strict=True):
+        rest = values[: moving[0] if moving.size else 0]
+        rest = rest[np.isfinite(rest)]
+        if rest.size:
+            yield name, float(rest.mean()), float(rest.std()) / math.sqrt(rest.size)
+
+
+def _tare(grid: _SampleGrid, labels: DetectedSteps) -> tuple[_SampleGrid, tuple[str, ...]]:
+    """Return the samples less what they read in the still beginning, and a note of it.
+
+    As a laboratory's own tests are tared before they begin. A force that a damper holds at rest is
+    that of its friction or of a preload, which is real.
+    """
+    zeros = {
+        name: zero
+        for name, zero, error in _measure_rest(grid, labels)
+        if abs(zero) > MIN_ZERO_ERRORS * error and name != "damper_force_n"
+    }
+    if not zeros:
+        return grid, ()
+    values = grid.values - np.array([[zeros.get(name, 0.0)] for name in grid.channels])
+    parts = (f"{name} by {zero:.3g}" for name, zero in zeros.items())
+    return replace(grid, values=values), (f"tared where it is still: {', '.join(parts)}",)
 
 
 def _has_config_texts(table: ForeignTable) -> bool:
