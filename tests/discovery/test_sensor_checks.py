@@ -16,7 +16,7 @@ from tests.builders.laboratories import draw_laboratory
 from tests.discovery.played import SNM, blocks
 from twin.discovery.build_verdict import build_sensors
 from twin.discovery.discover import PreparedLog, prepare_problem
-from twin.discovery.sensor_checks import SensorCheck, check_sensors
+from twin.discovery.sensor_checks import SensorCheck, check_sensors, compare_sensors
 from twin.discovery.signals import build_signals
 from twin.discovery.words import describe_sensors
 
@@ -163,6 +163,19 @@ def test_samples_that_are_known_to_be_invalid_are_no_fault(channel: str, share: 
     values[lost.channels.index(MASS[1])] = delay(lost.channel(MASS[1]), lost)
     fault = find_faults(replace(lost, values=values))["lag", MASS]
     assert fault.value == pytest.approx(7e-4, rel=0.2)
+
+
+def test_hum_that_could_not_be_taken_off_is_no_disagreement() -> None:
+    """As where a harmonic of the drive hides it for most of the time."""
+    clean = build_signals((record(),), "log", MASS_KG, (0.002, 0.002))
+    time_s = np.arange(clean.time_s.size) * clean.grid.decimation / clean.grid.rate_hz
+    hum = clean.grid.from_time_domain(0.5 * np.sin(2 * np.pi * 50.02 * time_s))
+    humming = replace(clean, spectra={**clean.spectra, MASS[1]: clean.spectra[MASS[1]] + hum})
+    for lines_hz, is_healthy in (((), False), ((50.04,), True)):
+        checks = compare_sensors(replace(humming, hum_hz=lines_hz))
+        of_mass = [check for check in checks if check.channels == MASS]
+        assert of_mass
+        assert all(check.is_healthy for check in of_mass) is is_healthy
 
 
 def test_an_offset_beside_lost_samples_is_no_noise() -> None:

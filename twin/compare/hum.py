@@ -7,7 +7,7 @@ What is in a channel while a harmonic lies at the line is never taken for hum, h
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -83,14 +83,20 @@ def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
         return values
     known = interpolate_missing(values)
     spectrum, hz = rfft(known - known.mean()), rfftfreq(known.size, 1.0 / rate_hz)
-    is_hum = np.zeros(hz.size, dtype=bool)
-    for line in _measure_lasting_lines(known[None], rate_hz):
-        if line.stands_out[0]:
-            is_hum |= np.abs(hz - line.frequency_hz) < BEAT_HZ
+    lines = _measure_lasting_lines(known[None], rate_hz)
+    is_hum = find_near_lines(hz, [line.frequency_hz for line in lines if line.stands_out[0]])
     power = np.abs(spectrum) ** 2
     if power[is_hum].sum() > 0.5 * power.sum():
         return values
     return values - irfft(np.where(is_hum, spectrum, 0.0), known.size)
+
+
+def find_near_lines(hz: Float1D, lines_hz: Iterable[float]) -> Bool1D:
+    """Return which frequencies, (frequency,), lie where hum of these lines may beat."""
+    is_near = np.zeros(hz.size, dtype=bool)
+    for line_hz in lines_hz:
+        is_near |= np.abs(hz - line_hz) < BEAT_HZ
+    return is_near
 
 
 def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:

@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 
 from table_io.block import Bool2D, Float1D, Label
 from table_io.channels import CHANNEL_BY_NAME
+from twin.compare.hum import find_near_lines
 from twin.compare.spectra import Spectrum
 from twin.discovery.least_squares import FitResult
 from twin.discovery.nuisances import list_sizes
@@ -144,6 +145,7 @@ def _compare_pair(
     sigma = np.sqrt(variance * signals.grid.size)
     strong = (np.abs(acc) ** 2 > STRONG_RATIO * sigma**2) & (signals.omega > 0)
     strong &= signals.low_pass > 0.5
+    strong &= ~find_near_lines(signals.omega / (2.0 * np.pi), signals.hum_hz)
     if strong.sum() < 10:
         return
     valid = _select_valid(signals)

@@ -190,12 +190,12 @@ def describe_sensors(sensors: Sensors) -> list[str]:
     for check in sensors.checks:
         if check.healthy and not (check.kind == "remainder" and check.limit):
             continue
-        allowed = (
-            f", allowed {'from' if check.kind in ('filter', 'resonance') else 'up to'} "
-            f"{_format_size(check, check.limit)}"
-            if check.limit
-            else ""
-        ) + ("; the intervals do not count it" if check.healthy else "")
+        limit = _format_size(check, check.limit) if check.limit else ""
+        side = "from" if check.kind in ("filter", "resonance") else "up to"
+        if check.healthy:
+            allowed = f", within the {limit} allowed; the intervals do not count it"
+        else:
+            allowed = f", allowed {side} {limit}" if limit else ""
         lines.append(
             f"  {KIND_LABELS.get(check.kind, check.kind)} of "
             f"{' against '.join(check.channels)}: {_format_size(check, check.value)}{allowed}"
