@@ -3,21 +3,24 @@
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import cast
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import ClassVar, cast
 
 import numpy as np
 import pytest
 
-from table_io.block import Float1D, Int1D
-from twin.discovery.least_squares import FitResult, fit_parameters
-from twin.discovery.parameters import BaseKey, FreeParameter, ParameterSet
+from table_io.block import Bool1D, Float1D, Int1D
+from twin.discovery.least_squares import FitResult, fit_parameters, fit_with_misfit
+from twin.discovery.nuisances import MAX_SIZE
+from twin.discovery.parameters import BaseKey, FreeParameter, NuisanceKey, ParameterSet
 from twin.discovery.residuals import LogResiduals
 
 COUNT, BLOCK = 600, 20
 Left = Callable[[float, float], Float1D]
 
 
-A, B = BaseKey("a"), BaseKey("b")
+A, B, LAG = BaseKey("a"), BaseKey("b"), NuisanceKey(0, "lag", "force_r1_n")
 
 
 class Toy:
@@ -175,3 +178,59 @@ def test_a_slope_is_attenuated_by_the_noise_of_its_reading_unless_it_is_taken_of
     left = fit.values[A] * 0.5
     expected = math.hypot(left, 0.1, (2.0 - slope) * 1.0)
     assert float(fit.held_out[0].std()) == pytest.approx(expected, rel=0.1)
+
+
+@dataclass(frozen=True)
+class Misread:
+    """What a fit asks of a sheet with one nuisance: readings y over their noise, a law a x."""
+
+    x: Float1D
+    y: Float1D
+    weights: dict[str, float] = field(default_factory=dict)
+    log_number, rows, noise_copy = 0, ("damper",), property(lambda self: self)
+    expected_squares: ClassVar[dict[str, float]] = {}
+    signals: ClassVar[SimpleNamespace] = SimpleNamespace(step=np.array([-1]))
+
+    @property
+    def entry_row(self) -> Int1D:
+        return np.append(np.zeros(self.x.size, dtype=np.int64), 1)
+
+    @property
+    def entry_weight(self) -> Float1D:
+        return np.where(self.entry_row == 0, self.weights.get("damper", 1.0), 1.0)
+
+    @property
+    def sample_block(self) -> Int1D:
+        return np.arange(self.x.size) // BLOCK
+
+    @property
+    def entry_contact_block(self) -> Int1D:
+        return np.append(self.sample_block, 0)
+
+    @property
+    def row_mask(self) -> list[Bool1D]:
+        return [np.ones(self.x.size, dtype=bool)]
+
+    def evaluate(self, parameters: ParameterSet) -> Float1D:
+        z = parameters.values[LAG]
+        read = self.y - parameters.values[A] * self.x - z * np.abs(self.x)
+        return np.append(read, z) / self.entry_weight
+
+    def nuisance_slope(self, key: NuisanceKey) -> Float1D:
+        return np.append(-np.abs(self.x), 1.0) / self.entry_weight
+
+
+@pytest.mark.parametrize(("lacking", "z"), [(0.0, 2.0), (400.0, 0.0)])
+def test_a_nuisance_explains_what_its_prior_allows_and_no_law_that_is_lacking(
+    lacking: float, z: float
+) -> None:
+    """Half of such a law has the form of the nuisance, which would run to 200 typical sizes."""
+    draw = np.random.default_rng(3)
+    x = draw.uniform(-1.0, 1.0, COUNT)
+    y = 5.0 * x + 2.0 * (lacking == 0) * np.abs(x) + draw.standard_normal(COUNT)
+    sheet = Misread(x, y + lacking * np.maximum(x - 0.2, 0.0))
+    start = ParameterSet(
+        {A: 1.0, LAG: 0.0}, (free(A), FreeParameter(LAG, -math.inf, math.inf, 1.0, ""))
+    )
+    fit = fit_with_misfit([cast(LogResiduals, sheet)], start)
+    assert fit.values[LAG] == pytest.approx(z, abs=MAX_SIZE if lacking else 0.3)

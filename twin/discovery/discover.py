@@ -323,15 +323,16 @@ def discover_effects(
 def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedProblem:
     """Return the problem with nuisances, and noise, about a model with effects."""
     problem, parameters = prepared.problem, fitted.fit.parameters
-    log_residuals = tuple(
-        linearize_nuisances(
-            replace(residuals, noise_scale={}), parameters, calibrate=True, mapper=problem.mapper
-        )
-        for residuals in problem.log_residuals
-    )
+    log_residuals = tuple(replace(residuals, noise_scale={}) for residuals in problem.log_residuals)
     own = [free for free in parameters.free if not isinstance(free.key, NuisanceKey)]
-    start = _start_nuisances(log_residuals, parameters.with_free(own))
-    fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
+    for _ in range(LINEARIZATION_COUNT):
+        log_residuals = tuple(
+            linearize_nuisances(residuals, parameters, calibrate=True, mapper=problem.mapper)
+            for residuals in log_residuals
+        )
+        start = _start_nuisances(log_residuals, parameters.with_free(own))
+        fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
+        parameters = fit.parameters
     base = fitted.remove_from(fit.parameters)
     log_residuals = tuple(
         learn_noise(residuals, fit.parameters, base) for residuals in log_residuals

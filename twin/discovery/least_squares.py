@@ -105,16 +105,28 @@ def fit_with_misfit(
 ) -> FitResult:
     """Fit without noise; what the model leaves beyond noise counts as noise too.
 
-    Else nuisances would run as far as lowers it, whatever their priors. The cost and the
-    cross-validation residual of the result are over the noise alone nevertheless.
+    Else nuisances would run as far as lowers it, whatever their priors. Where they do not explain
+    all of it, it is measured while they stay where they were, and again after they have explained
+    of that what they can as if it were noise. The cost and the cross-validation residual of the
+    result are over the noise alone nevertheless.
     """
-    fit = fit_parameters(log_residuals, start, mapper=mapper)
-    weighted = [weigh_misfit(residuals, fit.parameters) for residuals in log_residuals]
+    parameters = fit_parameters(log_residuals, start, mapper=mapper).parameters
+    weighted = _weigh_all(log_residuals, parameters)
+    if any(
+        (new.entry_weight > old.entry_weight).any()
+        for new, old in zip(weighted, log_residuals, strict=True)
+    ):
+        specimen = [free for free in start.free if not isinstance(free.key, NuisanceKey)]
+        held = fit_parameters(log_residuals, start.with_free(specimen), mapper=mapper).parameters
+        parameters = fit_parameters(
+            _weigh_all(log_residuals, held), held.with_free(start.free), mapper=mapper
+        ).parameters
+        weighted = _weigh_all(log_residuals, parameters)
     ratios = [
         new.entry_weight / old.entry_weight
         for new, old in zip(weighted, log_residuals, strict=True)
     ]
-    fit = fit_parameters(weighted, fit.parameters, folds=folds, mapper=mapper, without_noise=True)
+    fit = fit_parameters(weighted, parameters, folds=folds, mapper=mapper, without_noise=True)
     entries = [residuals.evaluate(fit.parameters) for residuals in log_residuals]
     held_out = tuple(
         np.where(residuals.entry_row < len(residuals.rows), ratio, 1.0) * values
@@ -127,6 +139,12 @@ def fit_with_misfit(
         held_out=held_out,
         white_errors={key: error / white for key, error in fit.white_errors.items()},
     )
+
+
+def _weigh_all(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet
+) -> list[LogResiduals]:
+    return [weigh_misfit(residuals, parameters) for residuals in log_residuals]
 
 
 def compute_slopes(

@@ -357,9 +357,7 @@ def _measure_rest_offsets(grid: _SampleGrid, labels: DetectedSteps) -> dict[str,
     return offsets
 
 
-def _measure_rest(
-    grid: _SampleGrid, labels: DetectedSteps
-) -> Iterator[tuple[str, float, float]]:
+def _measure_rest(grid: _SampleGrid, labels: DetectedSteps) -> Iterator[tuple[str, float, float]]:
     """Yield (channel, mean, its standard error if noise is white) in the still beginning, in SI."""
     moving = np.flatnonzero(labels.label != Label.REST)
     for name, values in zip(grid.channels, grid.values, strict=True):
