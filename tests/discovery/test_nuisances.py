@@ -30,6 +30,7 @@ from twin.discovery.nuisances import (
     LASERS,
     MAX_SIZE,
     TYPICAL_GAIN,
+    TYPICAL_LASER_OFFSET,
     TYPICAL_SHARE,
     correct_signals,
     linearize_nuisances,
@@ -190,6 +191,23 @@ def test_a_prior_holds_every_nuisance() -> None:
     assert all(math.isinf(free.high) for free in list_nuisance_parameters([residuals]))
     assert not sensor_mask(residuals)[0]  # the damper row
     assert sensor_mask(residuals)[-1]
+
+
+def test_without_a_rest_a_laser_may_have_any_zero() -> None:
+    """Else a relaxing branch that forgets it would take the place of the spring."""
+    one = log(noise=0.2)
+    spectra = dict(one.signals.spectra)
+    spectra["mass_disp_m"] = spectra["mass_disp_m"] + 3e-3 * one.signals.unit_spectrum
+    moved = replace(one.signals, spectra=spectra)
+    cut = replace(moved, rest_values={}, rest_noise={})
+    for signals, zero in (
+        (moved, TYPICAL_LASER_OFFSET * moved.channel_rms("mass_disp_m")),
+        (cut, 3e-3),
+    ):
+        sizes = {(each.kind, each.place): each.size for each in list_nuisances(signals)}
+        assert sizes["offset", "mass_disp_m"] == pytest.approx(zero, rel=0.1)
+    fit = prepare_problem([replace(one, signals=cut)], SNM).first_fit
+    assert fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.01)
 
 
 def test_what_nothing_contradicts_is_no_nuisance() -> None:

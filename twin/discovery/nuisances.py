@@ -87,6 +87,7 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     paired = {cell for cells in pairs.values() for cell in cells}
     # The gains of two cells are that of their sum, and their shares.
     scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
+    is_component = "damper_force_n" in channels
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S, "s") for channel in checkable]
     nuisances += [
@@ -100,12 +101,13 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     ]
     for channel in channels:
         share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
-        size = share * signals.channel_rms(channel)
+        size, unit = share * signals.channel_rms(channel), CHANNEL_BY_NAME[channel].unit
+        # Without a rest the zero of a motion may be anywhere; that of a cell shows in flight.
+        is_open = channel in (*LASERS, *ACCELEROMETERS) and channel not in signals.rest_values
+        mean = signals.channel_mean(channel) if is_open and not is_component else 0.0
+        nuisances.append(Nuisance("offset", channel, max(size, abs(mean)), unit))
         nuisances += [
-            Nuisance(
-                "offset" + (str(term) if term else ""), channel, size, CHANNEL_BY_NAME[channel].unit
-            )
-            for term in range(SLOW_TERMS + 1)
+            Nuisance(f"offset{term}", channel, size, unit) for term in range(1, SLOW_TERMS + 1)
         ]
     for channel in channels:
         if channel in LASERS:

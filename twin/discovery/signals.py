@@ -145,13 +145,20 @@ class LogSignals:
 
     def channel_rms(self, channel: str) -> float:
         """Return the rms of a channel about its mean while the drive moves, SI."""
-        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
+        values = self._values_in_motion(channel)
         return float(values.std()) if values.size else 0.0
+
+    def channel_mean(self, channel: str) -> float:
+        """Return the mean of a channel while the drive moves, SI."""
+        values = self._values_in_motion(channel)
+        return float(values.mean()) if values.size else 0.0
+
+    def _values_in_motion(self, channel: str) -> Float1D:
+        return self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
 
     def largest_reading(self, channel: str) -> float:
         """Return the largest absolute reading of a channel while the drive moves, SI."""
-        values = self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
-        return float(np.abs(values).max(initial=0.0))
+        return float(np.abs(self._values_in_motion(channel)).max(initial=0.0))
 
     @property
     def relative_spectrum(self) -> Spectrum:
