@@ -195,10 +195,10 @@ def test_a_prior_holds_every_nuisance() -> None:
 
 def test_without_a_rest_a_laser_may_have_any_zero() -> None:
     """Else a relaxing branch that forgets it would take the place of the spring."""
-    one = log(noise=0.2)
-    spectra = dict(one.signals.spectra)
-    spectra["mass_disp_m"] = spectra["mass_disp_m"] + 3e-3 * one.signals.unit_spectrum
-    moved = replace(one.signals, spectra=spectra)
+    quiet = log(noise=0.2)
+    spectra = dict(quiet.signals.spectra)
+    spectra["mass_disp_m"] = spectra["mass_disp_m"] + 3e-3 * quiet.signals.unit_spectrum
+    moved = replace(quiet.signals, spectra=spectra)
     cut = replace(moved, rest_values={}, rest_noise={})
     for signals, zero in (
         (moved, TYPICAL_LASER_OFFSET * moved.channel_rms("mass_disp_m")),
@@ -206,7 +206,7 @@ def test_without_a_rest_a_laser_may_have_any_zero() -> None:
     ):
         sizes = {(each.kind, each.place): each.size for each in list_nuisances(signals)}
         assert sizes["offset", "mass_disp_m"] == pytest.approx(zero, rel=0.1)
-    fit = prepare_problem([replace(one, signals=cut)], SNM).first_fit
+    fit = prepare_problem([replace(quiet, signals=cut)], SNM).first_fit
     assert fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.01)
 
 

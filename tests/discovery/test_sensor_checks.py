@@ -169,7 +169,7 @@ def test_hum_that_could_not_be_taken_off_is_no_disagreement() -> None:
     """As where a harmonic of the drive hides it for most of the time."""
     clean = build_signals((record(),), "log", MASS_KG, (0.002, 0.002))
     time_s = np.arange(clean.time_s.size) * clean.grid.decimation / clean.grid.rate_hz
-    hum = clean.grid.from_time_domain(0.5 * np.sin(2 * np.pi * 50.02 * time_s))
+    hum = clean.grid.from_time_domain(6.0 * np.sin(2 * np.pi * 50.02 * time_s))
     humming = replace(clean, spectra={**clean.spectra, MASS[1]: clean.spectra[MASS[1]] + hum})
     for lines_hz, is_healthy in (((), False), ((50.04,), True)):
         checks = compare_sensors(replace(humming, hum_hz=lines_hz))

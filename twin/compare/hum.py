@@ -7,7 +7,7 @@ What is in a channel while a harmonic lies at the line is never taken for hum, h
 
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -91,12 +91,10 @@ def subtract_hum(values: Float1D, rate_hz: float) -> Float1D:
     return values - irfft(np.where(is_hum, spectrum, 0.0), known.size)
 
 
-def find_near_lines(hz: Float1D, lines_hz: Iterable[float]) -> Bool1D:
+def find_near_lines(hz: Float1D, lines_hz: Sequence[float]) -> Bool1D:
     """Return which frequencies, (frequency,), lie where hum of these lines may beat."""
-    is_near = np.zeros(hz.size, dtype=bool)
-    for line_hz in lines_hz:
-        is_near |= np.abs(hz - line_hz) < BEAT_HZ
-    return is_near
+    far = np.abs(np.subtract.outer(hz, np.array(lines_hz))) >= BEAT_HZ
+    return np.asarray(~far.all(axis=1))
 
 
 def separate_hum(values: Float1D, rate_hz: float) -> tuple[Float1D, float]:

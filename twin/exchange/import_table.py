@@ -351,9 +351,9 @@ def _measure_rest_offsets(grid: _SampleGrid, labels: DetectedSteps) -> dict[str,
     offsets: dict[str, float] = {}
     for name, offset, _ in _measure_rest(grid, labels):
         motion = grid.values[grid.channels.index(name), moving[0] : moving[-1] + 1]
-        if np.isfinite(motion).any():
-            if abs(offset) > MAX_REST_SHARE * float(np.nanmax(motion) - np.nanmin(motion)):
-                offsets[name] = offset
+        motion = motion[np.isfinite(motion)]
+        if motion.size and abs(offset) > MAX_REST_SHARE * float(np.ptp(motion)):
+            offsets[name] = offset
     return offsets
 
 
