@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from table_io.block import Block, Float1D, Float2D, Int1D, Label, find_stretches
+from table_io.channels import CHANNEL_BY_NAME
 from table_io.config.base import format_toml, load_config, parse_toml
 from table_io.config.channel import declare_table_channels, read_channels
 from table_io.config.folders import find_config, resolve_config
@@ -49,6 +50,7 @@ MOTION_CHANNELS = (
 )  # steps are detected in the first one present
 NO_REST = "nothing is taken as rest: no channel has a zero, noise is taken from the motion"
 MAX_REST_SHARE = 0.1  # of the range of the motion, by which a channel may be off zero at rest
+TARED_CHANNELS = CHANNEL_BY_NAME.keys() - {"drive_disp_m", "damper_force_n"}
 MIN_ZERO_ERRORS = 4.0  # of its standard errors, from which a zero at rest is taken off
 MAX_COUNT = 10**6  # of steps, and of cycles in a step
 MAX_CYCLES_PER_STEP = 1000  # allowed in a profile
@@ -371,12 +373,12 @@ def _tare(grid: _SampleGrid, labels: DetectedSteps) -> tuple[_SampleGrid, tuple[
     """Return the samples less what they read in the still beginning, and a note of it.
 
     As a laboratory's own tests are tared before they begin. A force that a damper holds at rest is
-    that of its friction or of a preload, which is real.
+    that of its friction or of a preload, which is real; so is a temperature.
     """
     zeros = {
         name: zero
         for name, zero, error in _measure_rest(grid, labels)
-        if abs(zero) > MIN_ZERO_ERRORS * error and name != "damper_force_n"
+        if abs(zero) > MIN_ZERO_ERRORS * error and name in TARED_CHANNELS
     }
     if not zeros:
         return grid, ()
