@@ -5,17 +5,24 @@ import socket
 import pytest
 
 from table_io.errors import InputError
-from twin.transport.endpoint import check_can_listen, check_endpoint
+from twin.transport.endpoint import check_can_listen, check_endpoint, split_host_port
 
 LOOPBACK = "tcp/127.0.0.1:7447"
 
 
 @pytest.mark.parametrize(
-    ("endpoint", "has_keys"),
-    [(LOOPBACK, False), ("tcp/[::1]:1", False), ("tls/rig.lab:7447", True)],
+    ("endpoint", "has_keys", "address"),
+    [
+        (LOOPBACK, False, ("127.0.0.1", 7447)),
+        ("tcp/[::1]:1", False, ("::1", 1)),
+        ("tls/rig.lab:7447", True, ("rig.lab", 7447)),
+    ],
 )
-def test_an_allowed_endpoint_passes(endpoint: str, has_keys: bool) -> None:
+def test_an_allowed_endpoint_has_a_host_and_a_port(
+    endpoint: str, has_keys: bool, address: tuple[str, int]
+) -> None:
     check_endpoint("simulated", endpoint, has_keys)
+    assert split_host_port(endpoint) == address
 
 
 @pytest.mark.parametrize(

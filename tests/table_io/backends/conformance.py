@@ -359,6 +359,8 @@ def close_is_safe_at_any_time(bench: Bench) -> None:
     moving.read(MOTION_SAMPLES // 2)
     moving.close()
     moving.close()
+    for backend in (unopened, idle, moving):
+        require_error(RuntimeError, lambda backend=backend: backend.read(1), "read after close")  # type: ignore[misc]
 
 
 @acquisition_clause
