@@ -368,8 +368,8 @@ def _limit_level(
             if math.isfinite(foreseen):
                 ratio, aim = foreseen, FORESEEN_SHARE
             share = min(share, aim * entry.limit_si / (math.exp(ratio) * reference))
-    if config.predicted is not None:
-        predicted = config.predicted.level_m_s2(levels.sweep, frequency_hz)
+    if config.predicted_sweep is not None:
+        predicted = config.predicted_sweep.level_m_s2(levels.sweep, frequency_hz)
         share = min(share, predicted / reference) if math.isfinite(predicted) else share
     if before is not None and before.level_m_s2:
         last = before.level_m_s2 / config.level_m_s2(before.frequency_hz)
@@ -390,10 +390,10 @@ def foresee_ratio(
     NaN without a prediction, or where that jumps on the way: the specimen jumps at another place.
     What was measured before a jump of the twin says nothing about its other branch.
     """
-    if config.predicted is None or not points:
+    if config.predicted_sweep is None or not points:
         return math.nan
 
-    predict = partial(config.predicted.log_ratio, sweep, channel)
+    predict = partial(config.predicted_sweep.log_ratio, sweep, channel)
     near = [point for point in points if abs(predict(ln_f) - predict(point[0])) < JUMP_CHANGE]
     if points[-1] not in near:
         return math.nan

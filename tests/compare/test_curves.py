@@ -26,7 +26,7 @@ LEVEL = 0.05 * 9.80665
 Curve = Callable[[float], float]
 
 
-def measured(
+def make_response(
     eta_d: float,
     spread: float = 0.002,
     eta_a: float = 1.0,
@@ -51,7 +51,7 @@ def sweep(
     """Points in driving order, up and back, with 0.4 % of scatter between the directions."""
     rng = np.random.default_rng(1)
     return [
-        point(direction, hz, measured(curve(hz) * (1 + 0.002 * rng.standard_normal())), source)
+        point(direction, hz, make_response(curve(hz) * (1 + 0.002 * rng.standard_normal())), source)
         for direction, curve, ordered in (
             ("forward", forward, grid),
             ("backward", backward, grid[::-1]),
@@ -186,7 +186,7 @@ def test_chaotic_scatter_is_no_hysteresis(seed: int) -> None:
         for hz in GRID:
             etas = 0.3 * (1 + 0.1 * rng.standard_normal(3))
             points.append(
-                point(direction, hz, measured(etas.mean(), float(np.ptp(etas) / etas.mean())))
+                point(direction, hz, make_response(etas.mean(), float(np.ptp(etas) / etas.mean())))
             )
     assert detect_hysteresis(points, "measured") == ([], [])
 
@@ -215,7 +215,7 @@ def branches(
 
 def test_a_hysteresis_of_eta_a_alone() -> None:
     """eta_d differs by 8 %, eta_a by 18 %: below the jump the smaller acceleration."""
-    below, above = measured(0.108, eta_a=0.69), measured(0.1175, eta_a=0.84)
+    below, above = make_response(0.108, eta_a=0.69), make_response(0.1175, eta_a=0.84)
     points = both(branches(3.55, above, below), branches(2.65, above, below))
     assert detect_hysteresis(points, "measured") == (
         [PrcJump("forward", 3.5, 3.6, "up"), PrcJump("backward", 2.7, 2.6, "down")],
@@ -227,23 +227,24 @@ def test_a_hysteresis_of_eta_a_alone() -> None:
     ("below", "above", "is_found"),
     [
         # 5 % in eta_a, and one impact more in every cycle
-        (measured(0.115, eta_a=0.80, impacts=(2, 2, 2)),
-         measured(0.116, eta_a=0.84, impacts=(1, 1, 1)), True),
+        (make_response(0.115, eta_a=0.80, impacts=(2, 2, 2)),
+         make_response(0.116, eta_a=0.84, impacts=(1, 1, 1)), True),
         # the same with a cycle that has as many impacts as the others
-        (measured(0.115, eta_a=0.80, impacts=(2, 1, 2)),
-         measured(0.116, eta_a=0.84, impacts=(1, 1, 1)), False),
+        (make_response(0.115, eta_a=0.80, impacts=(2, 1, 2)),
+         make_response(0.116, eta_a=0.84, impacts=(1, 1, 1)), False),
         # a grazing contact more: the count, but neither eta
-        (measured(0.115, eta_a=0.80, impacts=(1, 1, 1)),
-         measured(0.116, eta_a=0.81, impacts=(0, 0, 0)), False),
+        (make_response(0.115, eta_a=0.80, impacts=(1, 1, 1)),
+         make_response(0.116, eta_a=0.81, impacts=(0, 0, 0)), False),
         # 5 % in eta_a are within its scatter
-        (measured(0.115, eta_a=0.80, spread_a=0.03, impacts=(2, 2, 2)),
-         measured(0.116, eta_a=0.84, spread_a=0.03, impacts=(1, 1, 1)), False),
+        (make_response(0.115, eta_a=0.80, spread_a=0.03, impacts=(2, 2, 2)),
+         make_response(0.116, eta_a=0.84, spread_a=0.03, impacts=(1, 1, 1)), False),
         # an old recording without the scatter of eta_a: eta_d alone
-        (measured(0.115, eta_a=0.50, spread_a=None), measured(0.116, eta_a=0.84), False),
+        (make_response(0.115, eta_a=0.50, spread_a=None), make_response(0.116, eta_a=0.84), False),
         # a lost load cell: no counts
-        (measured(0.115, eta_a=0.80, impacts=()), measured(0.116, eta_a=0.84), False),
+        (make_response(0.115, eta_a=0.80, impacts=()), make_response(0.116, eta_a=0.84), False),
         # a lost accelerometer
-        (measured(0.115, eta_a=math.nan, spread_a=math.nan), measured(0.116, eta_a=0.84), False),
+        (make_response(0.115, eta_a=math.nan, spread_a=math.nan),
+         make_response(0.116, eta_a=0.84), False),
     ],
 )  # fmt: skip
 def test_impact_counts_decide_on_a_small_difference_beyond_its_scatter(
@@ -284,7 +285,7 @@ def test_noise_of_a_healthy_sweep_is_no_hysteresis_of_eta_a(noise: float) -> Non
     def noisy(hz: float) -> NormalizedResponse:
         eta_d = 0.1 * hz * (1 + 0.1 * noise * rng.standard_normal(3))
         eta_a = 0.3 * hz * (1 + noise * rng.standard_normal(3))
-        return measured(
+        return make_response(
             float(eta_d.mean()), float(np.ptp(eta_d) / eta_d.mean()), float(eta_a.mean()),
             float(np.ptp(eta_a) / eta_a.mean()), tuple(rng.integers(1, 3, 3).tolist()),
         )  # fmt: skip
@@ -305,7 +306,7 @@ def swept(gap_m: float, start_hz: float, stop_hz: float) -> list[PrcPoint]:
     etas = (driven.column("u_max") - driven.column("u_min"))[:, -3:] / (2 * u_star)
     return [
         point("forward" if k < len(grid) else "backward", hz,
-              measured(row.mean(), float(np.ptp(row) / row.mean())))
+              make_response(row.mean(), float(np.ptp(row) / row.mean())))
         for k, (hz, row) in enumerate(zip([*grid, *grid[::-1]], etas, strict=True))
     ]  # fmt: skip
 
@@ -366,14 +367,14 @@ def test_gm2_has_a_left_one_in_the_model() -> None:
 def test_a_sudden_change_is_a_ratio_that_no_smooth_branch_reaches(
     before: tuple[float, float], after: tuple[float, float], change: int
 ) -> None:
-    first, second = (point("forward", hz, measured(eta)) for hz, eta in (before, after))
+    first, second = (point("forward", hz, make_response(eta)) for hz, eta in (before, after))
     assert find_sudden_change(first, second, "measured") == change
 
 
 def test_a_sudden_change_needs_two_points_of_one_direction() -> None:
-    a = point("forward", 4.0, measured(0.2))
+    a = point("forward", 4.0, make_response(0.2))
     assert find_sudden_change(None, a, "measured") == 0
-    assert find_sudden_change(a, point("backward", 4.2, measured(0.03)), "measured") == 0
+    assert find_sudden_change(a, point("backward", 4.2, make_response(0.03)), "measured") == 0
     assert find_sudden_change(a, point("forward", 4.2, None), "measured") == 0
     assert find_sudden_change(point("forward", 4.0, None), a, "measured") == 0
 
@@ -382,7 +383,7 @@ def test_a_sudden_change_needs_two_points_of_one_direction() -> None:
 def test_amplitudes_beyond_a_tenth_and_the_scatter_are_different_solutions(
     eta: float, is_apart: bool
 ) -> None:
-    first, second = (replace(measured(value), spread=0.05) for value in (1.0, eta))
+    first, second = (replace(make_response(value), spread=0.05) for value in (1.0, eta))
     assert (compare_amplitudes(first, second) > 1) == is_apart
     assert compare_amplitudes(first, second, allowance=1.0) < 1
 

@@ -255,7 +255,7 @@ def count_impacts(cycles: list[CycleExtremes]) -> tuple[int, ...]:
     return values.impacts_right
 
 
-def held(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[CycleExtremes]:
+def make_cycles(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[CycleExtremes]:
     """Settle and measured cycles of 500 samples with onsets where they fall."""
     return [
         cycle(
@@ -269,7 +269,7 @@ def held(places: Sequence[int], settle: int = 1, measure: int = 3) -> list[Cycle
 
 def test_jitter_about_the_cut_between_cycles_counts_one_each() -> None:
     places = [498, 1003, 1496, 2001]  # about 500, 1000, 1500, 2000: 2 0 1 1 between plain cuts
-    cycles = held(places)
+    cycles = make_cycles(places)
     assert [len(cycle.measured.onsets_r) for cycle in cycles if cycle.measured] == [1, 0, 2, 0]
     assert count_impacts(cycles) == (1, 1, 1)
 
@@ -278,7 +278,7 @@ def test_jitter_about_the_cut_between_cycles_counts_one_each() -> None:
 @pytest.mark.parametrize("settle", [0, 1, 2])
 def test_one_impact_per_cycle_at_any_phase(phase: int, settle: int) -> None:
     places = [phase + 500 * number for number in range(3 + settle)]
-    assert count_impacts(held(places, settle)) == (1, 1, 1)
+    assert count_impacts(make_cycles(places, settle)) == (1, 1, 1)
 
 
 @pytest.mark.parametrize("phase", range(0, 500, 50))
@@ -286,16 +286,16 @@ def test_a_third_slight_impact_in_one_cycle_is_that_cycles(phase: int) -> None:
     """Two a cycle, in the last but one a third (physics.md: 0.71 Hz)."""
     places = [phase + 500 * k + more for k in range(-1, 4) for more in (0, 60)]
     places.append(phase + 500 * 2 + 120)
-    impacts = count_impacts(held([place for place in places if place >= 0]))
+    impacts = count_impacts(make_cycles([place for place in places if place >= 0]))
     assert sorted(impacts) == [2, 2, 3]
 
 
 def test_no_onset_is_no_impact() -> None:
-    assert count_impacts(held([])) == (0, 0, 0)
+    assert count_impacts(make_cycles([])) == (0, 0, 0)
 
 
 def test_impacts_of_settle_cycles_do_not_count() -> None:
-    assert count_impacts(held([100, 200, 300], settle=2)) == (0, 0, 0)
+    assert count_impacts(make_cycles([100, 200, 300], settle=2)) == (0, 0, 0)
 
 
 # Quantities
@@ -565,7 +565,9 @@ def test_lost_samples_of_the_table_leave_it_unknown() -> None:
 
 def test_a_point_says_step_direction_and_frequency() -> None:
     turn = 2 * math.pi * 4.0 * np.arange(1000) / RATE_HZ
-    got = build_prc_point(Step(7, "backward", 4.0, LEVEL), held([]), LEVEL * np.sin(turn), scale())
+    got = build_prc_point(
+        Step(7, "backward", 4.0, LEVEL), make_cycles([]), LEVEL * np.sin(turn), scale()
+    )
     assert (got.index, got.step, got.direction, got.frequency_hz) == (2000, 7, "backward", 4.0)
     assert got.measured is not None
     assert got.twin is None

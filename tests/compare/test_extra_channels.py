@@ -8,7 +8,7 @@ import pytest
 from table_io.block import Block, Float1D
 from table_io.channels import CHANNELS, Channel
 from tests.builders.blocks import recut_blocks
-from tests.compare.test_twins import G4, measured, run_twins, shaken, twin
+from tests.compare.test_twins import G4, make_measured_block, run_twins, shaken, twin
 from twin.compare import COMPARED_CHANNELS
 from twin.compare.extra_channels import select_predicted
 from twin.compare.twins import TwinSetup
@@ -32,8 +32,8 @@ def with_rows(block: Block, **rows: Float1D) -> Block:
 
 def lab_block(noise: float = 0.0) -> Block:
     """A block with a row for each declared channel, exact but for the noise of the others."""
-    block = measured(G4, shaken(seconds=1.5), noise=noise)
-    exact = measured(G4, shaken(seconds=1.5))
+    block = make_measured_block(G4, shaken(seconds=1.5), noise=noise)
+    exact = make_measured_block(G4, shaken(seconds=1.5))
     speed = run_twins(setup(), [exact])[0].channel("free/rel_vel_m_s")
     force = exact.channel("force_r1_n") + exact.channel("force_r2_n")
     assert force.max() > 100.0
@@ -76,7 +76,7 @@ def test_each_is_compared_with_its_sign() -> None:
 
 
 def test_each_twin_is_compared_with_its_own_prediction() -> None:
-    block = measured(G4, shaken(seconds=1.5), noise=1.0)
+    block = make_measured_block(G4, shaken(seconds=1.5), noise=1.0)
     block = with_rows(block, mass_acc_2_m_s2=-block.channel("mass_acc_m_s2"))
     _, comparisons = run_twins(setup(ACC), [block])
     column, last = COMPARED_CHANNELS.index("mass_acc_m_s2"), comparisons[-1]
@@ -115,6 +115,6 @@ def test_an_error_of_a_canonical_sensor_is_not_that_of_another_on_the_same_body(
 
 
 def test_a_missing_channel_is_unknown() -> None:
-    block = measured(G4, shaken(seconds=1.0))
+    block = make_measured_block(G4, shaken(seconds=1.0))
     _, comparisons = run_twins(setup(ACC, LASER), [block])
     assert np.isnan([comparison.window_error_ss[-2:] for comparison in comparisons]).all()

@@ -52,7 +52,7 @@ def setup(bundle: RunConfig) -> pipeline.PipelineSetup:
 
 
 @pytest.fixture(scope="module")
-def measured(bundle: RunConfig) -> Block:
+def measured_block(bundle: RunConfig) -> Block:
     """Every measured sample of the test on the simulated table."""
     return table(bundle)
 
@@ -93,7 +93,7 @@ def run_pipeline(
     return items
 
 
-def predicted(items: Sequence[Item]) -> Block:
+def join_predictions(items: Sequence[Item]) -> Block:
     return join_blocks([item for item in items if isinstance(item, Block)])
 
 
@@ -113,11 +113,11 @@ def of(items: Sequence[Item], kind: type) -> list:
 
 @pytest.mark.parametrize("samples", [7, 64, 500])
 def test_cutting_the_samples_changes_no_bit(
-    setup: pipeline.PipelineSetup, measured: Block, samples: int
+    setup: pipeline.PipelineSetup, measured_block: Block, samples: int
 ) -> None:
-    whole = run_pipeline(setup, [measured])
-    cut = run_pipeline(setup, recut_blocks([measured], samples))
-    assert encode_item(predicted(cut), "") == encode_item(predicted(whole), "")
+    whole = run_pipeline(setup, [measured_block])
+    cut = run_pipeline(setup, recut_blocks([measured_block], samples))
+    assert encode_item(join_predictions(cut), "") == encode_item(join_predictions(whole), "")
     assert records(cut) == records(whole)
     kinds = {kind for kind, _ in records(whole)}
     assert kinds >= {
@@ -129,40 +129,40 @@ def test_cutting_the_samples_changes_no_bit(
         Estimate,
         JumpForecast,
     }, "the case must have every kind of item"
-    assert np.isfinite(predicted(whole).values[:, 1000:]).all()
+    assert np.isfinite(join_predictions(whole).values[:, 1000:]).all()
 
 
 @settings(max_examples=40)
 @given(data=st.data())
 def test_any_cut_of_a_stretch_changes_no_bit(
-    setup: pipeline.PipelineSetup, measured: Block, data: st.DataObject
+    setup: pipeline.PipelineSetup, measured_block: Block, data: st.DataObject
 ) -> None:
     """From the end of one step over the blend into the next: a point, cycles, restarts."""
-    first = int(np.flatnonzero(measured.step == 1)[0]) - 700
-    stretch = measured.cut(first, first + 1500)
+    first = int(np.flatnonzero(measured_block.step == 1)[0]) - 700
+    stretch = measured_block.cut(first, first + 1500)
     inner = st.integers(first + 1, first + 1499)
     cuts = sorted(data.draw(st.sets(inner, max_size=12)))
     edges = [first, *cuts, first + 1500]
     cut = run_pipeline(setup, [stretch.cut(a, b) for a, b in pairwise(edges)])
     whole = run_pipeline(setup, [stretch])
-    assert predicted(cut).is_identical(predicted(whole))
+    assert join_predictions(cut).is_identical(join_predictions(whole))
     assert records(cut) == records(whole)
 
 
 def test_lost_samples_are_lost_whatever_the_cut(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
-    values = measured.values.copy()
+    values = measured_block.values.copy()
     values[:, 2500:2507] = np.nan
-    holed = replace(measured, values=values)
-    pieces = [holed.cut(0, 4000), holed.cut(4100, measured.end)]
+    holed = replace(measured_block, values=values)
+    pieces = [holed.cut(0, 4000), holed.cut(4100, measured_block.end)]
     whole = run_pipeline(setup, pieces)
     for samples in (7, 64):
         cut = run_pipeline(
             setup, [block for piece in pieces for block in recut_blocks([piece], samples)]
         )
         assert records(cut) == records(whole)
-        for a, b in ((0, 4000), (4100, measured.end)):
+        for a, b in ((0, 4000), (4100, measured_block.end)):
             got, want = (
                 join_blocks([block for block in of(items, Block) if a <= block.index < b])
                 for items in (cut, whole)
@@ -173,9 +173,9 @@ def test_lost_samples_are_lost_whatever_the_cut(
 # Pure
 
 
-def test_step_is_pure(setup: pipeline.PipelineSetup, measured: Block) -> None:
+def test_step_is_pure(setup: pipeline.PipelineSetup, measured_block: Block) -> None:
     state, _ = pipeline.start_pipeline(setup)
-    for block in recut_blocks([measured], 997):
+    for block in recut_blocks([measured_block], 997):
         before = pickle.dumps(state)
         after, items = pipeline.step(setup, state, block)
         assert pickle.dumps(state) == before
@@ -186,15 +186,15 @@ def test_step_is_pure(setup: pipeline.PipelineSetup, measured: Block) -> None:
 
 
 def test_a_state_that_travelled_goes_on_the_same(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
     """The state is the whole memory: pickled in the middle, nothing is lost."""
     middle = 3333
     state, _ = pipeline.start_pipeline(setup)
-    state, first = pipeline.step(setup, state, measured.cut(0, middle))
+    state, first = pipeline.step(setup, state, measured_block.cut(0, middle))
     travelled = pickle.loads(pickle.dumps(state))
-    rest = run_pipeline(setup, [measured.cut(middle, measured.end)], travelled)
-    assert records([*first, *rest]) == records(run_pipeline(setup, [measured]))
+    rest = run_pipeline(setup, [measured_block.cut(middle, measured_block.end)], travelled)
+    assert records([*first, *rest]) == records(run_pipeline(setup, [measured_block]))
 
 
 def test_start_says_the_parameters(setup: pipeline.PipelineSetup) -> None:
@@ -207,9 +207,9 @@ def test_start_says_the_parameters(setup: pipeline.PipelineSetup) -> None:
 
 
 def test_every_held_cycle_and_every_step_once(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
-    items = run_pipeline(setup, [measured])
+    items = run_pipeline(setup, [measured_block])
     cycles, points = of(items, CycleExtremes), of(items, PrcPoint)
     assert [(cycle.step, cycle.cycle) for cycle in cycles] == [
         (s, c) for s in range(4) for c in range(5)
@@ -217,8 +217,8 @@ def test_every_held_cycle_and_every_step_once(
     assert [point.step for point in points] == [0, 1, 2, 3]
     for cycle in cycles:
         window = slice(cycle.index - cycle.count, cycle.index)
-        assert set(measured.step[window]) == {cycle.step}
-        assert set(measured.cycle[window]) == {cycle.cycle}
+        assert set(measured_block.step[window]) == {cycle.step}
+        assert set(measured_block.cycle[window]) == {cycle.cycle}
         assert cycle.label == (Label.SETTLE if cycle.cycle < 3 else Label.MEASURE)
         assert cycle.measured is not None
         for place in (*cycle.measured.onsets_r, *cycle.measured.onsets_l):
@@ -228,11 +228,11 @@ def test_every_held_cycle_and_every_step_once(
 
 
 def test_a_twin_beside_the_table_says_what_is_measured(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
     """Forward 3.0 Hz after a soft start; backward the same frequency in free flight or not: the
     twin, from no more than the table's acceleration, is where the rig is."""
-    for point in of(run_pipeline(setup, [measured]), PrcPoint):
+    for point in of(run_pipeline(setup, [measured_block]), PrcPoint):
         assert point.twin is not None
         assert point.twin.eta_d == pytest.approx(point.measured.eta_d, rel=0.03)
         assert point.twin.impacts_right == point.measured.impacts_right
@@ -251,28 +251,32 @@ def test_the_gap_at_onset_corrects_a_gap_that_is_stated_wrong(bundle: RunConfig)
 
 @pytest.mark.parametrize("late", [1, 50, 200])
 def test_a_twin_that_wakes_within_a_held_cycle_says_nothing_about_it(
-    setup: pipeline.PipelineSetup, measured: Block, late: int
+    setup: pipeline.PipelineSetup, measured_block: Block, late: int
 ) -> None:
-    first = int(np.flatnonzero((measured.step == 1) & (measured.cycle == 1))[0])
-    items = run_pipeline(setup, recut_blocks([measured.cut(first + late, measured.end)], 64))
+    first = int(np.flatnonzero((measured_block.step == 1) & (measured_block.cycle == 1))[0])
+    items = run_pipeline(
+        setup, recut_blocks([measured_block.cut(first + late, measured_block.end)], 64)
+    )
     assert [(cycle.step, cycle.cycle) for cycle in of(items, CycleExtremes)][:2] == [(1, 2), (1, 3)]
     assert [point.step for point in of(items, PrcPoint)] == [1, 2, 3]
 
 
 def test_a_twin_that_wakes_within_the_measured_cycles_makes_no_point_of_them(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
-    first = int(np.flatnonzero((measured.step == 1) & (measured.cycle == 3))[0])
-    items = run_pipeline(setup, recut_blocks([measured.cut(first + 5, measured.end)], 64))
+    first = int(np.flatnonzero((measured_block.step == 1) & (measured_block.cycle == 3))[0])
+    items = run_pipeline(
+        setup, recut_blocks([measured_block.cut(first + 5, measured_block.end)], 64)
+    )
     assert next((cycle.step, cycle.cycle) for cycle in of(items, CycleExtremes)) == (1, 4)
     assert [point.step for point in of(items, PrcPoint)] == [2, 3]
 
 
 def test_missing_samples_leave_no_cycle_and_no_point_across_them(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
-    first = int(np.flatnonzero((measured.step == 1) & (measured.cycle == 3))[0])
-    pieces = [measured.cut(0, first + 50), measured.cut(first + 60, measured.end)]
+    first = int(np.flatnonzero((measured_block.step == 1) & (measured_block.cycle == 3))[0])
+    pieces = [measured_block.cut(0, first + 50), measured_block.cut(first + 60, measured_block.end)]
     items = run_pipeline(setup, pieces)
     assert (1, 3) not in {(cycle.step, cycle.cycle) for cycle in of(items, CycleExtremes)}
     assert [point.step for point in of(items, PrcPoint)] == [0, 2, 3]
@@ -280,9 +284,9 @@ def test_missing_samples_leave_no_cycle_and_no_point_across_them(
 
 @pytest.mark.parametrize("into", [30, 150, 250])
 def test_a_stop_in_a_cycle_leaves_no_partial_cycle(
-    bundle: RunConfig, setup: pipeline.PipelineSetup, measured: Block, into: int
+    bundle: RunConfig, setup: pipeline.PipelineSetup, measured_block: Block, into: int
 ) -> None:
-    asked = int(np.flatnonzero((measured.step == 0) & (measured.cycle == 2))[0]) + into
+    asked = int(np.flatnonzero((measured_block.step == 0) & (measured_block.cycle == 2))[0]) + into
     stopped = table(bundle, stop_at=asked)
     assert (stopped.label == Label.STOP).any()
     items = run_pipeline(setup, recut_blocks([stopped], 20))
@@ -294,23 +298,25 @@ def test_a_stop_in_a_cycle_leaves_no_partial_cycle(
 
 
 def test_contact_at_the_start_of_a_held_cycle_is_no_impact_by_itself(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
     """Permanent contact, as of a precompressed bumper, is never an onset."""
-    values = measured.values.copy()
-    values[measured.channels.index("force_r1_n")] = 400.0
-    items = run_pipeline(setup, [replace(measured, values=values)])
+    values = measured_block.values.copy()
+    values[measured_block.channels.index("force_r1_n")] = 400.0
+    items = run_pipeline(setup, [replace(measured_block, values=values)])
     assert not any(cycle.measured.onsets_r for cycle in of(items, CycleExtremes))
 
 
 def test_lost_load_cells_and_accelerometer_leave_the_displacement(
-    setup: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
     lost = ("mass_acc_m_s2", "force_l1_n", "force_l2_n")
-    kept = [place for place, name in enumerate(measured.channels) if name not in lost]
-    names = tuple(measured.channels[place] for place in kept)
-    items = run_pipeline(setup, [replace(measured, channels=names, values=measured.values[kept])])
-    whole = of(run_pipeline(setup, [measured]), PrcPoint)
+    kept = [place for place, name in enumerate(measured_block.channels) if name not in lost]
+    names = tuple(measured_block.channels[place] for place in kept)
+    items = run_pipeline(
+        setup, [replace(measured_block, channels=names, values=measured_block.values[kept])]
+    )
+    whole = of(run_pipeline(setup, [measured_block]), PrcPoint)
     for got, want in zip(of(items, PrcPoint), whole, strict=True):
         assert got.twin is None  # it never had a state to start from
         assert got.measured.eta_d == want.measured.eta_d
@@ -318,8 +324,8 @@ def test_lost_load_cells_and_accelerometer_leave_the_displacement(
         assert np.isnan([got.measured.eta_a, got.measured.r_l]).all()
 
 
-def test_a_leap_is_an_event(setup: pipeline.PipelineSetup, measured: Block) -> None:
-    events = of(run_pipeline(setup, [measured]), Event)
+def test_a_leap_is_an_event(setup: pipeline.PipelineSetup, measured_block: Block) -> None:
+    events = of(run_pipeline(setup, [measured_block]), Event)
     assert {event.kind for event in events} == {"jump"}
     assert "forward, 3 to 4.6 Hz: eta_d" in events[0].text
 
@@ -351,30 +357,30 @@ def but_events(items: Sequence[Item]) -> list[tuple[type, bytes]]:
 def test_a_decided_step_has_its_cycles_and_its_point_but_no_leap(
     setup: pipeline.PipelineSetup,
     first_only: pipeline.PipelineSetup,
-    measured: Block,
+    measured_block: Block,
     added_steps: list[StepAdded],
 ) -> None:
     """Visits come at odd frequencies, on either branch: what differs there is no jump."""
-    whole = run_pipeline(setup, [measured])
-    items = run_pipeline(pipeline.add_steps(first_only, *added_steps), [measured])
+    whole = run_pipeline(setup, [measured_block])
+    items = run_pipeline(pipeline.add_steps(first_only, *added_steps), [measured_block])
     assert but_events(items) == but_events(whole)
     assert of(whole, Event)
     assert not of(items, Event)
 
 
 def test_comparison_does_not_depend_on_when_and_how_often_a_step_is_announced(
-    first_only: pipeline.PipelineSetup, measured: Block, added_steps: list[StepAdded]
+    first_only: pipeline.PipelineSetup, measured_block: Block, added_steps: list[StepAdded]
 ) -> None:
     at_once = run_pipeline(
-        pipeline.add_steps(first_only, *added_steps), recut_blocks([measured], 250)
+        pipeline.add_steps(first_only, *added_steps), recut_blocks([measured_block], 250)
     )
     one_by_one, setup = [], first_only
     state, _ = pipeline.start_pipeline(setup)
     begins = {
-        added_step.step: int(np.flatnonzero(measured.step == added_step.step)[0])
+        added_step.step: int(np.flatnonzero(measured_block.step == added_step.step)[0])
         for added_step in added_steps
     }
-    for block in recut_blocks([measured], 250):
+    for block in recut_blocks([measured_block], 250):
         for added_step in added_steps:
             if begins[added_step.step] < block.end + 250:
                 setup = pipeline.add_steps(setup, added_step)
@@ -385,8 +391,10 @@ def test_comparison_does_not_depend_on_when_and_how_often_a_step_is_announced(
 
 
 def test_step_that_was_not_announced_is_skipped(
-    setup: pipeline.PipelineSetup, first_only: pipeline.PipelineSetup, measured: Block
+    setup: pipeline.PipelineSetup, first_only: pipeline.PipelineSetup, measured_block: Block
 ) -> None:
-    items = run_pipeline(first_only, [measured])
+    items = run_pipeline(first_only, [measured_block])
     assert {record.step for record in (*of(items, CycleExtremes), *of(items, PrcPoint))} == {0}
-    assert predicted(items).is_identical(predicted(run_pipeline(setup, [measured])))
+    assert join_predictions(items).is_identical(
+        join_predictions(run_pipeline(setup, [measured_block]))
+    )

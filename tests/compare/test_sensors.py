@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.builders.blocks import recut_blocks
-from tests.compare.test_twins import G4, RATE_HZ, measured, run_twins, shaken, track
+from tests.compare.test_twins import G4, RATE_HZ, make_measured_block, run_twins, shaken, track
 from twin.compare.sensors import delay_signal
 from twin.compare.twins import TwinSetup, advance_twins
 from twin.laws.library import find_effect
@@ -47,7 +47,7 @@ def test_a_cubic_is_delayed_exactly(samples: float) -> None:
 def test_the_cut_changes_no_bit_with_effects_and_sensors(samples: int) -> None:
     full_model = model(*EVERYTHING).with_effect("sensor_lag", "mass_acc_m_s2", lag=1.3e-3)
     full_model = full_model.with_effect("sensor_gain", "mass_disp_m", gain=1.02)
-    block = measured(G4, shaken(seconds=1.2), noise=1.0)
+    block = make_measured_block(G4, shaken(seconds=1.2), noise=1.0)
     whole, comparisons = run_twins(setup(full_model), [block])
     cut, others = run_twins(setup(full_model), list(recut_blocks([block], samples)))
     assert cut.is_identical(whole)
@@ -55,7 +55,7 @@ def test_the_cut_changes_no_bit_with_effects_and_sensors(samples: int) -> None:
 
 
 def test_sensors_change_the_reading_and_nothing_else() -> None:
-    block = measured(G4, shaken(seconds=1.0))
+    block = make_measured_block(G4, shaken(seconds=1.0))
     plain = run_twins(setup(Model(G4)), [block])[0]
     bent = Model(G4).with_effect("sensor_gain", "force_r1_n", gain=1.1)
     bent = bent.with_effect("sensor_lag", "mass_acc_m_s2", lag=2 / RATE_HZ)
@@ -68,7 +68,7 @@ def test_sensors_change_the_reading_and_nothing_else() -> None:
 
 def test_an_offset_is_taken_out_of_the_restart_and_put_into_the_reading() -> None:
     """A displacement sensor off by 0.5 mm, and a model that knows: as good as none."""
-    block = measured(G4, shaken(seconds=1.5))
+    block = make_measured_block(G4, shaken(seconds=1.5))
     values = block.values.copy()
     values[block.channels.index("mass_disp_m")] += 5e-4
     off = replace(block, values=values)
@@ -87,7 +87,7 @@ def test_hidden_states_go_on_over_a_restart() -> None:
     solver, base = prepare_solver(memory_model, RATE_HZ), shaken(seconds=2.5)
     out, state = np.empty((7, base.size)), solver.rest_state()
     solver.advance(state, base, base, out)
-    block = measured(G4, base)
+    block = make_measured_block(G4, base)
     rows = block.values.copy()
     for name, row in (("mass_disp_m", out[0] + rows[0]), ("mass_acc_m_s2", out[2]),
                       ("force_r1_n", out[3] / 2), ("force_r2_n", out[3] / 2),
@@ -106,7 +106,7 @@ def test_tracks_of_a_model_with_effects_are_values() -> None:
     twin_setup = setup(model("bouc_wen"))
     from twin.compare.twins import start_twins
 
-    block = measured(G4, shaken(seconds=0.8))
+    block = make_measured_block(G4, shaken(seconds=0.8))
     tracks = start_twins(twin_setup, 0)
     first = advance_twins(twin_setup, tracks, block)[1]
     assert advance_twins(twin_setup, tracks, block)[1].is_identical(first)

@@ -59,7 +59,7 @@ def motion(parameters: Parameters, base_acc: Float1D, state: Float1D | None = No
     return out
 
 
-def measured(
+def make_measured_block(
     parameters: Parameters,
     base_acc: Float1D,
     index: int = 0,
@@ -223,14 +223,14 @@ def reference(setup: TwinSetup, block: Block) -> tuple[Float2D, Float2D]:
 def test_restarts_are_at_multiples_of_the_window_and_nowhere_else(index: int, samples: int) -> None:
     """With a wrong model, so that a restart elsewhere would show."""
     setup = twin(replace(FREE, stiffness=33e3))
-    block = measured(FREE, shaken(seconds=1.5), index=index, noise=1.0)
+    block = make_measured_block(FREE, shaken(seconds=1.5), index=index, noise=1.0)
     predicted, _ = run_twins(setup, list(recut_blocks([block], samples)))
     for name, want in zip(("free", "window"), reference(setup, block), strict=True):
         np.testing.assert_array_equal(track(predicted, name)[[0, 1, 3]], want)
 
 
 def test_predictions_are_causal() -> None:
-    block = measured(G4, shaken(), noise=1.0)
+    block = make_measured_block(G4, shaken(), noise=1.0)
     other = replace(block, values=np.where(np.arange(len(block)) < 4000, block.values, 1.0))
     a, _ = run_twins(twin(), [block])
     b, _ = run_twins(twin(), [other])
@@ -240,7 +240,7 @@ def test_predictions_are_causal() -> None:
 
 def test_a_wrong_model_errs_boundedly_in_windows_and_more_when_free() -> None:
     """10 % off in stiffness, in flight near resonance: the free twin keeps its own amplitude."""
-    block = measured(FREE, shaken(hz=1.25, seconds=8.0), noise=1.0)
+    block = make_measured_block(FREE, shaken(hz=1.25, seconds=8.0), noise=1.0)
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     predicted, _ = run_twins(twin(replace(FREE, stiffness=1.1 * 36e3), window=200), [block])
     error = abs(predicted.channel("window/rel_disp_m") - u)[1000:]
@@ -251,7 +251,7 @@ def test_a_wrong_model_errs_boundedly_in_windows_and_more_when_free() -> None:
 
 
 def test_a_right_model_stays_with_the_measurement() -> None:
-    block = measured(G4, shaken(), noise=1.0)
+    block = make_measured_block(G4, shaken(), noise=1.0)
     predicted, _ = run_twins(twin(), [block])
     u = block.channel("mass_disp_m") - block.channel("table_disp_m")
     for name in ("free", "window"):
@@ -261,7 +261,7 @@ def test_a_right_model_stays_with_the_measurement() -> None:
 
 
 def test_mass_displacement_is_that_of_the_measured_table_and_the_predicted_u() -> None:
-    block = measured(G4, shaken(seconds=1.0))
+    block = make_measured_block(G4, shaken(seconds=1.0))
     predicted, _ = run_twins(twin(), [block])
     np.testing.assert_array_equal(
         predicted.channel("window/mass_disp_m"),
@@ -278,7 +278,7 @@ def restarted_errors(
     """Window NRMSE of F_R and F_L of a clean measurement with restarts every `window` samples."""
     base_acc = shaken()
     _, _, _, force_r, force_l, *_ = motion(truth, base_acc)
-    block = measured(truth, base_acc, without=without)
+    block = make_measured_block(truth, base_acc, without=without)
     predicted, _ = run_twins(twin(model, window), [block])
     return (
         nrmse(force_r, 2 * predicted.channel("window/force_r1_n")),
@@ -310,7 +310,7 @@ def test_memory_of_a_slow_bumper_needs_its_history() -> None:
     """History is eight relaxation times: 0.8 s here, so no restart comes before that."""
     setup = twin(SLOW, window=100)
     assert setup.history_samples == 1600
-    predicted, _ = run_twins(setup, [measured(SLOW, shaken())])
+    predicted, _ = run_twins(setup, [make_measured_block(SLOW, shaken())])
     known = np.flatnonzero(np.isfinite(predicted.channel("window/rel_disp_m")))
     assert known[0] == 1601
 
@@ -318,7 +318,7 @@ def test_memory_of_a_slow_bumper_needs_its_history() -> None:
 def test_negative_gap_at_rest_stays_in_both_contacts() -> None:
     """Precompressed by 1 mm a side: 510 N each, and no motion after a restart."""
     pressed = replace(G4, gap_r=-0.001, gap_l=-0.001)
-    predicted, _ = run_twins(twin(pressed), [measured(pressed, np.zeros(2000))])
+    predicted, _ = run_twins(twin(pressed), [make_measured_block(pressed, np.zeros(2000))])
     window = track(predicted, "window")[:, 501:]
     np.testing.assert_allclose(window[0], 0.0, atol=1e-12)
     np.testing.assert_allclose(2 * window[4:].reshape(4, -1)[[0, 2]], 510.0, rtol=1e-9)
@@ -333,7 +333,7 @@ def test_negative_gap_in_motion() -> None:
 
 
 def test_without_an_accelerometer_nothing_is_predicted() -> None:
-    block = measured(G4, shaken(seconds=1.0), without=("mass_acc_m_s2",))
+    block = make_measured_block(G4, shaken(seconds=1.0), without=("mass_acc_m_s2",))
     predicted, comparisons = run_twins(twin(), [block])
     assert np.isnan(predicted.values).all()
     assert len(comparisons) == 100
@@ -348,7 +348,7 @@ def test_without_an_accelerometer_nothing_is_predicted() -> None:
 def test_lost_table_acceleration_silences_both_twins_until_a_whole_history(
     window: int, samples: int
 ) -> None:
-    block = spoilt(measured(G4, shaken(), noise=1.0), "table_acc_m_s2", 3120, 3131)
+    block = spoilt(make_measured_block(G4, shaken(), noise=1.0), "table_acc_m_s2", 3120, 3131)
     predicted, _ = run_twins(twin(window=window), list(recut_blocks([block], samples)))
     again = -(-(3130 + H) // window) * window  # the first restart index with H clean samples
     for name in ("free", "window"):
@@ -360,7 +360,7 @@ def test_lost_table_acceleration_silences_both_twins_until_a_whole_history(
 
 @pytest.mark.parametrize("channel", ["mass_disp_m", "mass_acc_m_s2"])
 def test_lost_motion_silences_only_the_windows_that_would_start_from_it(channel: str) -> None:
-    block = spoilt(measured(G4, shaken(), noise=1.0), channel, 3490, 3495)
+    block = spoilt(make_measured_block(G4, shaken(), noise=1.0), channel, 3490, 3495)
     predicted, _ = run_twins(twin(), [block])
     silent = np.isnan(predicted.channel("window/rel_disp_m"))
     assert np.flatnonzero(silent[501:]).tolist() == list(range(3000, 3500))
@@ -368,7 +368,7 @@ def test_lost_motion_silences_only_the_windows_that_would_start_from_it(channel:
 
 
 def test_lost_load_cell_samples_do_not_stop_a_restart() -> None:
-    block = measured(G4, shaken(), noise=1.0)
+    block = make_measured_block(G4, shaken(), noise=1.0)
     for cell in CHANNELS[4:]:
         block = spoilt(block, cell, 2900, 3600)
     predicted, _ = run_twins(twin(), [block])
@@ -378,7 +378,7 @@ def test_lost_load_cell_samples_do_not_stop_a_restart() -> None:
 
 
 def test_missing_samples_are_a_fresh_start() -> None:
-    setup, block = twin(), measured(G4, shaken(), noise=1.0)
+    setup, block = twin(), make_measured_block(G4, shaken(), noise=1.0)
     tracks, _, _ = advance_twins(setup, start_twins(setup, 0), block.cut(0, 2713))
     after = block.cut(2750, len(block))
     predicted, comparisons = run_twins(setup, [after], tracks)
@@ -393,7 +393,7 @@ def test_missing_samples_are_a_fresh_start() -> None:
 def test_a_twin_from_rest_never_restarts() -> None:
     """The model alone: no measurement is read, the free twin runs from rest at once."""
     setup = replace(twin(), from_rest=True)
-    block = measured(G4, shaken(seconds=1.0), without=CHANNELS[2:])
+    block = make_measured_block(G4, shaken(seconds=1.0), without=CHANNELS[2:])
     predicted, _ = run_twins(setup, [block])
     want = motion(G4, block.channel("table_acc_m_s2").copy())
     np.testing.assert_array_equal(predicted.channel("free/rel_disp_m"), want[0])
@@ -418,7 +418,7 @@ def direct(block: Block, predicted: Block, name: str) -> tuple[Float1D, Float1D,
 def test_one_comparison_per_grid_cell_with_the_sums_of_its_samples(
     index: int, samples: int
 ) -> None:
-    block = measured(G4, shaken(seconds=1.0), index=index, noise=1.0)
+    block = make_measured_block(G4, shaken(seconds=1.0), index=index, noise=1.0)
     predicted, comparisons = run_twins(twin(), list(recut_blocks([block], samples)))
     edges = [index, *range(20 * (index // 20 + 1), block.end + 1, 20)]
     assert [
@@ -439,7 +439,7 @@ def test_one_comparison_per_grid_cell_with_the_sums_of_its_samples(
 
 
 def test_a_comparison_of_a_missing_channel_is_nan_and_leaves_the_others() -> None:
-    block = measured(G4, shaken(seconds=1.0), without=("force_l1_n",))
+    block = make_measured_block(G4, shaken(seconds=1.0), without=("force_l1_n",))
     _, comparisons = run_twins(twin(), [block])
     place = COMPARED_CHANNELS.index("force_l1_n")
     last = asdict(comparisons[-1])
@@ -451,7 +451,7 @@ def test_a_comparison_of_a_missing_channel_is_nan_and_leaves_the_others() -> Non
 
 def test_a_comparison_holds_no_wall_clock() -> None:
     """Two runs over the same samples say the same bytes."""
-    block = measured(G4, shaken(seconds=0.6), noise=1.0)
+    block = make_measured_block(G4, shaken(seconds=0.6), noise=1.0)
     a, b = (run_twins(twin(), [block])[1] for _ in range(2))
     assert [encode_item(item, "run") for item in a] == [encode_item(item, "run") for item in b]
     assert len(a) == 60

@@ -171,12 +171,12 @@ def test_a_block_left_out_judges_a_single_log() -> None:
     chosen = choose_structure(trials, data)
     (run,) = judge_fitted_logs(chosen, trials, logs, data).runs
     assert run.error.twin == pytest.approx(chosen.error, rel=1e-4)
-    fitted = data[0].measured - data[0].projection.to_rows(
+    fitted = data[0].measured_rows - data[0].projection.to_rows(
         data[0].projection.transform_motion(
             chosen.model.simulate(logs[0].motion.command_m, RATE_HZ)[0], None
         )
     )
-    in_sample = np.linalg.norm(fitted) / np.linalg.norm(data[0].measured)
+    in_sample = np.linalg.norm(fitted) / np.linalg.norm(data[0].measured_rows)
     assert in_sample < run.error.twin < run.error.pure_delay
 
 

@@ -53,7 +53,7 @@ def export_formats(folder: Path, kinds: tuple[str, ...]) -> tuple[Path, Path]:
 LABEL_FIELDS = ("step", "label", "cycle")
 
 
-def measured(recording: Recording) -> tuple[np.ndarray, ...]:
+def join_measured_blocks(recording: Recording) -> tuple[np.ndarray, ...]:
     """(index, values, step, label, cycle) of every measured sample."""
     pieces = recording.contiguous_blocks("meas")
     index = np.concatenate([np.arange(piece.index, piece.end) for piece in pieces])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from table_io.block import Block
-from tests.exchange.exported import LOST, export_formats, measured
+from tests.exchange.exported import LOST, export_formats, join_measured_blocks
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import RATE, STEPS, amplitude, blocks, start_record
 from twin.exchange.export import ExportOptions, export_log
@@ -55,7 +55,7 @@ def plant_ratios(direction: str) -> tuple[list[float], list[complex]]:
 def test_h5py_reads_a_run_in_the_layout_of_nexus(both: tuple[Path, Path]) -> None:
     h5py = pytest.importorskip("h5py")
     log, out = both
-    index, values, *_ = measured(read_recording(log))
+    index, values, *_ = join_measured_blocks(read_recording(log))
     with h5py.File(out.with_suffix(".h5")) as file:
         entry = file[file.attrs["default"]]
         assert entry.attrs["NX_class"] == "NXentry"
@@ -75,7 +75,7 @@ def test_h5py_reads_a_run_in_the_layout_of_nexus(both: tuple[Path, Path]) -> Non
 def test_pyuff_reads_histories_and_frequency_responses(both: tuple[Path, Path]) -> None:
     pyuff = pytest.importorskip("pyuff")
     log, out = both
-    index, values, *_ = measured(read_recording(log))
+    index, values, *_ = join_measured_blocks(read_recording(log))
     file = pyuff.UFF(str(out.with_suffix(".uff")))
     sets = {entry["id1"].strip(): entry for entry in file.read_sets()}
     history = sets["mass_acc_m_s2"]

@@ -15,7 +15,7 @@ from table_io.config.base import PROFILES_DIR
 from table_io.errors import InputError
 from table_io.formats import read_table
 from table_io.records import RunStop, StepAdded
-from tests.exchange.exported import LABEL_FIELDS, LOST, export_formats, measured
+from tests.exchange.exported import LABEL_FIELDS, LOST, export_formats, join_measured_blocks
 from tests.input_errors import raises_input_error
 from tests.reports.recordings import MEASURED, RATE, STEPS, blocks, start_record
 from twin.cli.table import app
@@ -47,7 +47,7 @@ def out(both: tuple[Path, Path]) -> Path:
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_samples_and_labels_come_back_to_the_bit(log: Path, out: Path, kind: str) -> None:
-    index, values, *labels = measured(read_recording(log))
+    index, values, *labels = join_measured_blocks(read_recording(log))
     table = read_table(out.with_suffix(f".{kind}"))
     samples = read_samples(table, None)
     assert samples.rate_hz == RATE
@@ -65,7 +65,7 @@ def test_samples_and_labels_come_back_to_the_bit(log: Path, out: Path, kind: str
 @pytest.mark.parametrize("kind", FORMATS)
 def test_the_twin_goes_out_beside_the_measurement(log: Path, out: Path, kind: str) -> None:
     table = read_table(out.with_suffix(f".{kind}"))
-    index = measured(read_recording(log))[0]
+    index = join_measured_blocks(read_recording(log))[0]
     (predicted,) = read_recording(log).contiguous_blocks("pred")
     for name in ("free/rel_disp_m", "window/force_l2_n"):
         column = table.read_column(TWIN_PREFIX + name.replace("/", "_"))
@@ -117,7 +117,10 @@ def rows_by_entity(rrd: Path) -> dict[str, int]:
 def test_rerun_reads_its_file(log: Path, out: Path, tmp_path: Path) -> None:
     """In whatever order its parts were written."""
     rows = rows_by_entity(out.with_suffix(".rrd"))
-    assert sum(count >= measured(read_recording(log))[0].size for count in rows.values()) >= 3
+    assert (
+        sum(count >= join_measured_blocks(read_recording(log))[0].size for count in rows.values())
+        >= 3
+    )
     start = read_recording(log).start
     changing = [c for c in RrdReader(out.with_suffix(".rrd")).stream() if not c.is_static]
     for batch in (chunk.to_record_batch() for chunk in changing):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.exchange.exported import LABEL_FIELDS, export_formats, measured
+from tests.exchange.exported import LABEL_FIELDS, export_formats, join_measured_blocks
 from tests.reports.recordings import MEASURED, RATE
 from twin.recording.reader import read_recording
 
@@ -53,7 +53,7 @@ def messages(out: Path) -> dict[str, list[Any]]:
 def test_foxglove_gets_a_message_a_sample_at_its_time(
     log: Path, messages: dict[str, list[Any]]
 ) -> None:
-    index, values, *labels = measured(read_recording(log))
+    index, values, *labels = join_measured_blocks(read_recording(log))
     (predicted,) = read_recording(log).contiguous_blocks("pred")
     times = [STARTED_NS + round(sample * 1e9 / RATE) for sample in index.tolist()]
     for topic in ("/measured", "/twin"):

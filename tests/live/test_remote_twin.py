@@ -60,7 +60,7 @@ COMPARED = Comparison(END_SAMPLE + MAX_LEAD_SAMPLES - 1, 2, (), (), (), ())
 spec = spec_of_a_run
 
 
-def measured(number: int) -> Block:
+def make_block_at_rest(number: int) -> Block:
     """At rest."""
     rest = np.zeros(SIZE, dtype=np.int64)
     values = np.zeros((len(BUNDLE.rig.channels), SIZE))
@@ -157,7 +157,9 @@ def rig(spec: ProcessConfig) -> Iterator[Rig]:
     thread.start()
     assert played.ready.wait(PATIENCE_S)
     start = BUNDLE.make_start_factory(RUN, "table")({}, 0.0)
-    played.waiting += [(topic_for(item), encode_item(item, RUN)) for item in (start, measured(0))]
+    played.waiting += [
+        (topic_for(item), encode_item(item, RUN)) for item in (start, make_block_at_rest(0))
+    ]
     with pytest.MonkeyPatch.context() as patch:
         doors: list[Door] = []
         patch.setattr(os, "nice", lambda _: 0)
@@ -291,7 +293,7 @@ def test_second_remote_twin_publishes_a_fault(rig: Rig, monkeypatch: pytest.Monk
     thread.start()
     items: list[Item] = []
     for number in itertools.count(1):
-        rig.waiting.append((MEAS_TOPIC, encode_item(measured(number), RUN)))
+        rig.waiting.append((MEAS_TOPIC, encode_item(make_block_at_rest(number), RUN)))
         if (message := inbox.get(0.01)) is not None:
             items.append(decode_item(*message)[1])
         faults = [item for item in items if isinstance(item, Fault)]
@@ -300,7 +302,7 @@ def test_second_remote_twin_publishes_a_fault(rig: Rig, monkeypatch: pytest.Monk
     rig.waiting.append(
         ("/run/stop", encode_item(RunStop(faults[0].index + SIZE, "complete", "", ()), RUN))
     )
-    rig.waiting.append((MEAS_TOPIC, encode_item(measured(number + 1), RUN)))
+    rig.waiting.append((MEAS_TOPIC, encode_item(make_block_at_rest(number + 1), RUN)))
     thread.join(PATIENCE_S)
     assert codes == [0]
     (fault,) = faults

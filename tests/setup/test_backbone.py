@@ -98,7 +98,7 @@ def test_levels_of_the_plan_rise_and_a_latency_that_is_too_large_leaves_no_gain(
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, PlayedSession]:
+def measured_backbone(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, PlayedSession]:
     """Three levels of the shipped backbone, from 0.012 to 0.02 g, on the simulated rig."""
     path: Path = tmp_path_factory.mktemp("backbone") / "short.toml"
     text = (PROFILES_DIR / "tests" / "g4_backbone.toml").read_text(encoding="utf-8")
@@ -115,8 +115,8 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> tuple[Profile, PlayedS
 
 
 @pytest.mark.slow  # 14 s with those of the same session
-def test_backbone_is_that_of_the_plant(measured) -> None:
-    points = measured[1].select(OrbitPoint)
+def test_backbone_is_that_of_the_plant(measured_backbone) -> None:
+    points = measured_backbone[1].select(OrbitPoint)
     assert [(point.step, point.accepted, point.reason) for point in points] == [
         (0, True, ""), (1, True, ""), (2, True, ""),
     ]  # fmt: skip
@@ -130,16 +130,16 @@ def test_backbone_is_that_of_the_plant(measured) -> None:
 
 
 @pytest.mark.slow  # 14 s with those of the same session
-def test_feedback_vanished_in_phase_within_100_periods(measured) -> None:
-    for point in measured[1].select(OrbitPoint):
+def test_feedback_vanished_in_phase_within_100_periods(measured_backbone) -> None:
+    for point in measured_backbone[1].select(OrbitPoint):
         assert point.feedback_size_m <= 0.003 * point.command_m
         assert math.degrees(math.atan2(point.u_m[3], point.u_m[2])) == pytest.approx(0.0, abs=1.0)
         assert point.periods <= 100
 
 
 @pytest.mark.slow  # 14 s with those of the same session
-def test_nothing_is_lost_and_the_command_ends_at_rest(measured) -> None:
-    result = measured[1]
+def test_nothing_is_lost_and_the_command_ends_at_rest(measured_backbone) -> None:
+    result = measured_backbone[1]
     assert not [event for event in result.select(Event) if event.kind == "lost"]
     assert result.select(RunStop)[0].verdict == "complete"
     assert np.abs(result.command_m[-200:]).max() < 1e-6

@@ -53,23 +53,23 @@ def find_gain(model_hz: float) -> float:
 def test_prediction_is_the_level_that_keeps_the_limit(config: RunConfig) -> None:
     swept = config.profile.swept_sine
     assert swept is not None
-    assert swept.predicted is not None
+    assert swept.predicted_sweep is not None
     for hz in (0.9, 1.15, 1.29, 1.5, 2.3):
         steady = min(0.05, LIMIT_G / find_gain(hz)) * GRAVITY_M_S2
-        assert swept.predicted.level_m_s2(0, hz) == pytest.approx(steady, rel=0.1)
-    table = swept.predicted.table
-    mass = table[:, 3 + swept.predicted.channels.index("mass_acc_m_s2")]
+        assert swept.predicted_sweep.level_m_s2(0, hz) == pytest.approx(steady, rel=0.1)
+    table = swept.predicted_sweep.table
+    mass = table[:, 3 + swept.predicted_sweep.channels.index("mass_acc_m_s2")]
     assert mass.max() < 1.02 * LIMIT_G * GRAVITY_M_S2
 
 
 def test_run_plays_the_predicted_notch(config: RunConfig) -> None:
     swept = config.profile.swept_sine
     assert swept is not None
-    assert swept.predicted is not None
+    assert swept.predicted_sweep is not None
     played = play_session(config.profile, joins_blocks=True)
     ratios, mass = [], []
     for level in played.select(SweepLevel):
-        predicted = swept.predicted.level_m_s2(0, level.frequency_hz)
+        predicted = swept.predicted_sweep.level_m_s2(0, level.frequency_hz)
         if math.isfinite(predicted):
             ratios.append(level.measured_m_s2 / predicted)
         mass.append(level.amplitudes[level.channels.index("mass_acc_m_s2")])
@@ -90,11 +90,13 @@ def test_limits_of_own_channels_are_predicted_where_the_twin_knows_them(
     swept, canonical = read_run_config(path).profile.swept_sine, config.profile.swept_sine
     assert swept is not None
     assert canonical is not None
-    assert swept.predicted is not None
-    assert canonical.predicted is not None
-    assert SECOND_ACC in swept.predicted.channels
-    assert TEMPERATURE not in swept.predicted.channels
-    np.testing.assert_allclose(swept.predicted.table[:, 2], canonical.predicted.table[:, 2])
+    assert swept.predicted_sweep is not None
+    assert canonical.predicted_sweep is not None
+    assert SECOND_ACC in swept.predicted_sweep.channels
+    assert TEMPERATURE not in swept.predicted_sweep.channels
+    np.testing.assert_allclose(
+        swept.predicted_sweep.table[:, 2], canonical.predicted_sweep.table[:, 2]
+    )
 
 
 def test_level_before_a_jump_leaves_room_for_what_the_jump_does_to_the_table() -> None:

@@ -302,7 +302,7 @@ def try_hydraulic_fit(
     low, high = (np.array([bounds[name][k] for name in fit.names]) for k in (1, 2))
     count = sum(log.motion.command_m.size for log in logs)
     block_rows = fit.problem.block.size - 1
-    left = [log.measured.copy() for log in data]
+    left = [log.measured_rows.copy() for log in data]
     start = 0
     for number, (log, own) in enumerate(zip(logs, data, strict=True)):
         size = log.motion.command_m.size
@@ -348,7 +348,7 @@ def _gains_everywhere(
     for own, left, late in zip(data, trial.held_out, delay.held_out, strict=True):
         for part in np.unique(own.part):
             rows = own.part == part
-            piece = _cut_by_energy(own.measured[rows], PIECE_COUNT)
+            piece = _cut_by_energy(own.measured_rows[rows], PIECE_COUNT)
             gains = np.bincount(piece, (late**2 - left**2)[rows], PIECE_COUNT)
             if not gains.sum() > math.sqrt(PIECE_COUNT) * gains.std(ddof=1):
                 return False
@@ -406,8 +406,8 @@ def judge_other_logs(
     frf = next(trial for trial in trials if trial.id == "frf")
     left = (
         (
-            own.measured - _predict(chosen.model, log.motion, own),
-            own.measured - _predict(frf.model, log.motion, own),
+            own.measured_rows - _predict(chosen.model, log.motion, own),
+            own.measured_rows - _predict(frf.model, log.motion, own),
         )
         for log, own in zip(logs, data, strict=True)
     )
@@ -441,7 +441,7 @@ def estimate_with_channels(
         )
         terms = (*FRICTION_TERMS, *ESTIMATED_FRICTION, *channels)
     errors = (
-        _round_error(float(np.linalg.norm(rest) / np.linalg.norm(log.measured)))
+        _round_error(float(np.linalg.norm(rest) / np.linalg.norm(log.measured_rows)))
         for rest, log in zip(left or held_out, judges or data, strict=True)
     )
     return ChannelEstimate(channels=channels, errors=tuple(errors))
@@ -460,7 +460,7 @@ def _judge_run(
     log: NamedMotion, data: ResponseData, left: Float1D, left_by_frf: Float1D
 ) -> JudgedRun:
     """Return the errors of a twin and of the baselines on one log."""
-    measured = data.measured
+    measured = data.measured_rows
     late = data.delay_command(find_delay([data]))
     gain = float(late @ measured) / float(late @ late)
     residuals = {

@@ -271,7 +271,7 @@ class ResponseData:
     )  # further measured ones, (sample,) each
 
     @cached_property
-    def measured(self) -> Float1D:
+    def measured_rows(self) -> Float1D:
         """Measured acceleration in the band in m/s2, (row,)."""
         return self.projection.to_rows(self.measured_spectrum)
 
@@ -301,7 +301,7 @@ class ResponseData:
         Friction acts on the speed of the table, of which that of the command is a first guess.
         """
         projection = self.projection
-        change = projection.to_spectrum(self.measured - left - self.delay_command(delay_s))
+        change = projection.to_spectrum(self.measured_rows - left - self.delay_command(delay_s))
         jw = 2j * math.pi * projection.frequency_hz
         moved_m = self.command_m + projection.to_samples(change * np.exp(jw * delay_s) / jw**2)
         extended = extend_motion(moved_m, projection.rate_hz)
@@ -390,7 +390,7 @@ class ResponseRegression:
         grams, moments = np.zeros((parts, size, size)), np.zeros((parts, size))
         columns, residuals = [], []
         for log in data:
-            residual = log.measured - log.delay_command(delay_s)
+            residual = log.measured_rows - log.delay_command(delay_s)
             own = np.zeros((0, residual.size))
             if structure.terms:
                 own = log.compute_columns(structure.terms, delay_s, lags_s, resonance)
@@ -442,7 +442,7 @@ class ResponseRegression:
         columns = log.compute_columns(
             self.structure.terms, self.delay_s, self.lags_s, self.resonance
         )
-        return log.measured - log.delay_command(self.delay_s) - self.solve() @ columns
+        return log.measured_rows - log.delay_command(self.delay_s) - self.solve() @ columns
 
     def build_model(self) -> ResponseModel:
         """Return the model with the coefficients of all parts."""
@@ -469,7 +469,7 @@ def find_resonance(data: Sequence[ResponseData], delay_s: float) -> Resonance:
     grid_hz = np.arange(data[0].projection.band_hz[0], data[0].projection.band_hz[1], 0.02)
     power = np.zeros(grid_hz.size)
     for log in data:
-        residual = log.measured - log.delay_command(delay_s)
+        residual = log.measured_rows - log.delay_command(delay_s)
         own = np.abs(np.fft.rfft(residual)) ** 2 / float(residual @ residual)
         row_rate_hz = residual.size * log.projection.rate_hz / log.projection.count
         width = max(round(0.1 * residual.size / row_rate_hz), 1)
@@ -493,7 +493,7 @@ def find_resonance(data: Sequence[ResponseData], delay_s: float) -> Resonance:
 def measure_held_out(held_out: Sequence[Float1D], data: Sequence[ResponseData]) -> float:
     """Return the rms over the logs of what is left over the rms of the measured motion."""
     shares = [
-        float(rest @ rest) / float(log.measured @ log.measured)
+        float(rest @ rest) / float(log.measured_rows @ log.measured_rows)
         for rest, log in zip(held_out, data, strict=True)
     ]
     return math.sqrt(sum(shares) / len(shares))

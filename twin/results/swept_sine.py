@@ -71,8 +71,8 @@ def _describe_point(level: SweepLevel, config: SweptSine, rate_hz: float) -> Swe
         limited_by=level.limited_by,
         predicted_m_s2=(
             math.nan
-            if config.predicted is None
-            else config.predicted.level_m_s2(sweep, level.frequency_hz)
+            if config.predicted_sweep is None
+            else config.predicted_sweep.level_m_s2(sweep, level.frequency_hz)
         ),
     )
 

@@ -139,7 +139,7 @@ class SweptSine(Excitation):
         return name
 
     @cached_property
-    def predicted(self) -> "PredictedSweep | None":
+    def predicted_sweep(self) -> "PredictedSweep | None":
         """Level and responses by the specimen's twin; None if none are attached."""
         if self.prediction is None or self.prediction not in self.files:
             return None

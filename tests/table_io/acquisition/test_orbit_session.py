@@ -61,12 +61,12 @@ def make_profile(
 
 
 @pytest.fixture(scope="module")
-def held() -> PlayedSession:
+def held_orbits() -> PlayedSession:
     return play_session(make_profile(multiplier_periods=MULTIPLIER_PERIODS))
 
 
-def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> None:
-    points = held.select(OrbitPoint)
+def test_unstable_orbits_are_held_without_feedback_left(held_orbits: PlayedSession) -> None:
+    points = held_orbits.select(OrbitPoint)
     assert [(point.step, point.accepted, point.reason) for point in points] == [
         (0, True, ""),
         (1, True, ""),
@@ -76,7 +76,7 @@ def test_unstable_orbits_are_held_without_feedback_left(held: PlayedSession) -> 
         assert not point.stable
         assert point.acceleration_m_s2 == pytest.approx(0.49033, rel=0.006)
         assert point.periods <= 150 + MULTIPLIER_PERIODS
-    assert held.select(RunStop)[0].verdict == "complete"
+    assert held_orbits.select(RunStop)[0].verdict == "complete"
 
 
 def test_orbit_is_accepted_at_the_noise_that_its_feedback_has() -> None:
@@ -89,8 +89,8 @@ def test_orbit_is_accepted_at_the_noise_that_its_feedback_has() -> None:
     assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=0.002)
 
 
-def test_latency_of_the_feedback_is_stated(held: PlayedSession) -> None:
-    (event,) = [event for event in held.select(Event) if event.kind == "feedback"]
+def test_latency_of_the_feedback_is_stated(held_orbits: PlayedSession) -> None:
+    (event,) = [event for event in held_orbits.select(Event) if event.kind == "feedback"]
     measured_ms = float(event.text.split()[3])
     assert measured_ms == pytest.approx(45.0, abs=2.0)  # 30 ms to the command, 15 ms of servo
 
@@ -106,8 +106,8 @@ def test_true_orbits_are_those_by_shooting_on_the_plant() -> None:
     assert true == pytest.approx(TRUE_ORBITS[:, 2], rel=2e-3)
 
 
-def test_measured_orbits_are_those_of_the_plant(held: PlayedSession) -> None:
-    for point in held.select(OrbitPoint):
+def test_measured_orbits_are_those_of_the_plant(held_orbits: PlayedSession) -> None:
+    for point in held_orbits.select(OrbitPoint):
         true_mm = np.interp(point.frequency_hz, *TRUE_ORBITS[:, :2].T)
         # 3e-4 with what the feedback left moves u by
         assert 1e3 * math.hypot(*point.u_m[2:4]) == pytest.approx(true_mm, rel=5e-4)
@@ -131,8 +131,8 @@ def test_where_the_table_stands_is_no_part_of_an_orbit(monkeypatch: pytest.Monke
     assert [abs(each.x[0] - each.u[0]) < 3e-6 for each in measured] == [True] * len(measured)
 
 
-def test_measured_multipliers_are_those_of_the_plant(held: PlayedSession) -> None:
-    for point in held.select(OrbitPoint):
+def test_measured_multipliers_are_those_of_the_plant(held_orbits: PlayedSession) -> None:
+    for point in held_orbits.select(OrbitPoint):
         true = np.interp(point.frequency_hz, *TRUE_ORBITS[:, ::2].T)
         assert point.multiplier_sd is not None
         assert point.multiplier_sd < 0.15 * true
@@ -150,42 +150,46 @@ def measure_peak_acceleration(command_m: np.ndarray) -> float:
     return float(np.abs(acceleration).max())
 
 
-def find_stated_peak(held: PlayedSession) -> float:
+def find_stated_peak(held_orbits: PlayedSession) -> float:
     """Return the peak of the command in m/s2 that the check states, corrected as it was played."""
     profile = make_profile()
     drive = procedure.nominal_drive(procedure.make_test_plan(profile, RIG, 40))
     stated = max(row.acceleration_m_s2 for row in compute_demands(drive, profile, RIG))
     assert stated <= 1.15 * 0.49033
     correction = max(
-        p.command_m * (math.tau * p.frequency_hz) ** 2 for p in held.select(OrbitPoint)
+        p.command_m * (math.tau * p.frequency_hz) ** 2 for p in held_orbits.select(OrbitPoint)
     )
     return stated * correction / 0.49033
 
 
 def test_command_stays_below_the_peak_that_the_check_states_and_ends_at_rest(
-    held: PlayedSession,
+    held_orbits: PlayedSession,
 ) -> None:
-    assert 1.05 * 0.49 < measure_peak_acceleration(held.command_m) < find_stated_peak(held)
-    assert np.abs(held.command_m[-200:]).max() < 1e-6
+    assert (
+        1.05 * 0.49
+        < measure_peak_acceleration(held_orbits.command_m)
+        < find_stated_peak(held_orbits)
+    )
+    assert np.abs(held_orbits.command_m[-200:]).max() < 1e-6
 
 
 def test_stop_at_any_moment_of_hold_and_release_stays_below_the_stated_peak(
-    held: PlayedSession,
+    held_orbits: PlayedSession,
 ) -> None:
     """A stop multiplies the command by a decay over two cycles at least, within releases too."""
-    stated, worst = find_stated_peak(held), 0.0
+    stated, worst = find_stated_peak(held_orbits), 0.0
     x = np.arange(3000) / 1400.0  # two cycles at 2.87 Hz
     decay = 1.0 - smoothstep(x)
-    for at in range(round(20.0 * RATE_HZ), held.command_m.size - 5000, 211):
-        part = held.command_m[at - 300 : at + 3000] * np.append(np.ones(300), decay)
+    for at in range(round(20.0 * RATE_HZ), held_orbits.command_m.size - 5000, 211):
+        part = held_orbits.command_m[at - 300 : at + 3000] * np.append(np.ones(300), decay)
         worst = max(worst, measure_peak_acceleration(part))
     assert 1.05 * 0.49 < worst < stated
 
 
-def test_run_is_reproduced_to_the_bit(held: PlayedSession) -> None:
+def test_run_is_reproduced_to_the_bit(held_orbits: PlayedSession) -> None:
     again = play_session(make_profile(), stop_s=25.0)
     count = round(25.0 * RATE_HZ)
-    assert again.command_m[:count].tobytes() == held.command_m[:count].tobytes()
+    assert again.command_m[:count].tobytes() == held_orbits.command_m[:count].tobytes()
 
 
 @pytest.mark.slow  # 7 s
@@ -270,7 +274,7 @@ def test_operator_hold_in_a_release_lets_the_feedback_act_again(
     assert np.ptp(after) == pytest.approx(np.ptp(before), rel=0.03)
 
 
-def test_operator_stops_a_held_orbit(held: PlayedSession) -> None:
+def test_operator_stops_a_held_orbit(held_orbits: PlayedSession) -> None:
     stopped = play_session(make_profile(), stop_s=24.0)
     assert stopped.select(RunStop)[0].verdict == "stopped"
     assert stopped.command_m.size < 27.0 * RATE_HZ
