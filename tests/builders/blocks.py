@@ -8,6 +8,11 @@ from table_io.records import Record
 Item = Block | Record
 
 
+def select_blocks(items: Iterable[Item], stream: str) -> tuple[Block, ...]:
+    """Return the blocks of a stream as they were recorded, in their order."""
+    return tuple(item for item in items if isinstance(item, Block) and item.stream == stream)
+
+
 def recut_blocks(blocks: Iterable[Block], samples: int) -> Iterable[Block]:
     """Yield the same samples in blocks of length `samples` (the last one may be shorter)."""
     pending: list[Block] = []

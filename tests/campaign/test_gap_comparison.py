@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from table_io.block import Label
 from table_io.config.base import PROFILES_DIR
 from table_io.config.profile import Profile
+from tests.builders.blocks import select_blocks
 from tests.campaign.campaigns import write
 from tests.campaign.test_record_grid import BASE, make_record, write_grid
 from tests.input_errors import raises_input_error
@@ -343,8 +344,9 @@ def find_peaks(folder: Path) -> dict[str, tuple[float, float, float]]:
     peaks = {}
     for source, stream, prefix in (("measured", "meas", ""), ("twin", "pred", "free/")):
         series: dict[str, list[Any]] = {}
-        playing = {block.index: block.label == Label.MEASURE for block in recording.blocks("meas")}
-        for block in recording.blocks(stream):
+        measured = select_blocks(recording.items, "meas")
+        playing = {block.index: block.label == Label.MEASURE for block in measured}
+        for block in select_blocks(recording.items, stream):
             for name in block.channels:
                 series.setdefault(name, []).append(block.channel(name)[playing[block.index]])
         samples = {name: np.concatenate(parts) for name, parts in series.items()}

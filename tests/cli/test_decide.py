@@ -144,7 +144,7 @@ def test_a_refused_test_is_one_message_and_the_next_is_tried(
 
 def test_the_budget_counts_the_minutes_that_were_played(plain: Path) -> None:
     recording = read_recording(plain)
-    moved_s = recording.blocks("meas")[-1].end / 1000.0
+    moved_s = recording.contiguous_blocks("meas")[-1].end / 1000.0
     assert 15 / 2.0 < moved_s < 20.0
     assert decide.measure_minutes(plain) == pytest.approx(moved_s / 60.0)
 

@@ -81,7 +81,7 @@ def test_read_for_a_replay_is_the_same_as_read_whole(log_file: Path, recording: 
     quick, whole = RecordedRun.open(log_file), recorded_in(recording)
     assert quick.comparisons == whole.comparisons
     assert len(quick.recording.comparisons) == len(whole.comparisons)
-    assert not quick.recording.blocks("pred")
+    assert not quick.recording.contiguous_blocks("pred")
     assert quick.recording.contiguous_blocks("meas")[0].is_identical(
         recording.contiguous_blocks("meas")[0]
     )

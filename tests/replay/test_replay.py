@@ -11,7 +11,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import Comparison, Event, Fault, Params, PrcPoint, Record, RunStart, RunStop
-from tests.builders.blocks import drop_measured
+from tests.builders.blocks import drop_measured, select_blocks
 from tests.builders.recordings import store_items
 from tests.replay.in_memory import recorded_in
 from twin.compare import pipeline
@@ -181,7 +181,9 @@ def test_replay_is_dead_where_the_twin_was(
     assert comparisons(made) == comparisons(died)
     assert records(made) == records(died)
     for a, b in spans:
-        assert not any(block.index < b and block.end > a for block in made.blocks("pred"))
+        assert not any(
+            block.index < b and block.end > a for block in made.contiguous_blocks("pred")
+        )
     # after the fresh start it differs from a twin that never died, so the fault mattered
     never, _ = again(replace(died, items=store_items(
         item for item in died.items if not isinstance(item, Fault)
@@ -204,7 +206,7 @@ def test_a_fault_of_another_component_leaves_the_twin_alive(
 def test_missing_samples_are_replayed_as_they_were(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
-    measured = drop_measured(recording.blocks("meas"), 2500, 2600)
+    measured = drop_measured(select_blocks(recording.items, "meas"), 2500, 2600)
     kept: list[Item] = [recording.start, *measured, *recording.records(RunStop)]
     write_items(tmp_path / "holed.mcap", kept, recording.start)
     _, first = again(read_recording(tmp_path / "holed.mcap"), bundle, tmp_path)

@@ -13,6 +13,7 @@ from table_io.config.base import parse_toml
 from table_io.config.profile import Profile
 from table_io.config.tracking import TrackingConfig
 from table_io.units import GRAVITY_M_S2
+from tests.builders.blocks import select_blocks
 from tests.builders.rigs import RIG_TEXT
 from tests.setup.test_record import NO_CHECK, Run, play_run
 from twin.drawing.table_motion_figures import MOTION_FIGURES
@@ -196,10 +197,12 @@ def test_a_recording_without_its_begin_has_no_target(run: Run, tmp_path: Path) -
     """The windows that are left do not say where the history began."""
     _, recording, summary = run
     first = round(summary.tracking.from_s * recording.start.rate_hz)
-    blocks = [block for block in recording.blocks("meas") if block.index > first + 500]
+    blocks = [
+        block for block in select_blocks(recording.items, "meas") if block.index > first + 500
+    ]
     write_items(tmp_path / "run.mcap", list(blocks), recording.start)
     late = read_recording(tmp_path / "run.mcap")
-    assert len(late.blocks("meas")) == len(blocks)
+    assert len(select_blocks(late.items, "meas")) == len(blocks)
     assert summarise_tracking(late, read_profile(recording)) is None
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from table_io.block import Block
 from table_io.records import PredictionHash
+from tests.builders.blocks import select_blocks
 from twin.compare import pipeline
 from twin.compare.monitoring.low_cut import LowCutFilter, LowCutRemoval
 from twin.exchange.export import ExportOptions, export_log
@@ -68,8 +69,13 @@ def test_every_tenth_block_is_recorded_and_the_file_shrinks(
     sparse: Recording, recording: Recording
 ) -> None:
     assert (sparse.start.predictions_every, recording.start.predictions_every) == (10, 0)
-    assert {block.index // 20 % 10 for block in sparse.blocks("pred")} == {0}
-    assert 9.5 < sum(map(len, recording.blocks("pred"))) / sum(map(len, sparse.blocks("pred"))) < 10
+    assert {block.index // 20 % 10 for block in select_blocks(sparse.items, "pred")} == {0}
+    assert (
+        9.5
+        < sum(map(len, select_blocks(recording.items, "pred")))
+        / sum(map(len, select_blocks(sparse.items, "pred")))
+        < 10
+    )
     assert sparse.path.stat().st_size < 0.6 * recording.path.stat().st_size
     (measured,), (full,) = (each.contiguous_blocks("meas") for each in (sparse, recording))
     assert measured.is_identical(full)
@@ -131,7 +137,7 @@ def test_a_changed_hash_or_block_is_found(
     restore_predictions(read_recording(tmp_path / "hash.mcap"))
     assert "1 of " in capsys.readouterr().err
 
-    block = sparse.blocks("pred")[9]
+    block = select_blocks(sparse.items, "pred")[9]
     values = block.values.copy()
     values[3, 4] = np.nextafter(values[3, 4], np.inf)
     changed = [

@@ -12,6 +12,7 @@ from table_io.config.base import parse_toml
 from table_io.config.rig import RigConfig
 from table_io.formats import read_table
 from table_io.records import Comparison
+from tests.builders.blocks import select_blocks
 from tests.builders.profiles import AT_1_KHZ, format_test
 from tests.builders.rigs import EXTRA, LAB_TEXT, SECOND_ACC, TEMPERATURE, UPWARD_ACC
 from tests.input_errors import raises_input_error
@@ -185,7 +186,7 @@ def test_monitor_lists_declared_channels(run: Path) -> None:
     recording = read_recording(run / "run.mcap")
     state = LiveRunState()
     comparisons = [item for item in recording.items if isinstance(item, Comparison)]
-    items: list[Item] = [recording.start, *recording.blocks("meas"), *comparisons]
+    items: list[Item] = [recording.start, *select_blocks(recording.items, "meas"), *comparisons]
     for item in items:
         assert item.index >= 0
         state = update_run_state(state, recording.run, item)

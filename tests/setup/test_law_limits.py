@@ -128,7 +128,7 @@ def test_simulated_twin_that_fails_says_from_which_sample(tmp_path: Path) -> Non
     simulate_ideal(config, "own", tmp_path / "run.mcap", lambda _: None)
     recording = read_recording(tmp_path / "run.mcap")
     (event,) = (e for e in recording.records(Event) if e.kind == "twin_failed")
-    predicted = join_blocks([*recording.blocks("pred")])
+    predicted = join_blocks(recording.contiguous_blocks("pred"))
     assert np.isfinite(predicted.values[:8, : event.index]).all()
     assert not np.isfinite(predicted.values[:8, event.index]).all()
 

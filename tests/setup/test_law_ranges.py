@@ -116,7 +116,7 @@ def test_simulate_shows_and_records_the_exit_once(tmp_path: Path) -> None:
     (event,) = (event for event in recording.records(Event) if event.kind == "law_range")
     assert event.text.startswith(SENTENCE)
     assert shown.getvalue().count(event.text) == 1
-    u = np.abs(join_blocks([*recording.blocks("pred")]).channel("free/rel_disp_m"))
+    u = np.abs(join_blocks(recording.contiguous_blocks("pred")).channel("free/rel_disp_m"))
     end_m = 1e-3 + 0.02 * 2e-3  # with the margin, of the width of the range
     assert u[: event.index].max() <= end_m < u[event.index]
 

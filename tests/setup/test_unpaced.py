@@ -79,7 +79,7 @@ def level(summary: Any, direction: str, hz: float) -> float:
 
 def test_every_measured_sample_is_in_the_log_once(run: tuple) -> None:
     bundle, recording, _ = run
-    blocks = recording.blocks("meas")
+    blocks = recording.contiguous_blocks("meas")
     indices = np.concatenate([np.arange(block.index, block.end) for block in blocks])
     assert recording.stop is not None
     np.testing.assert_array_equal(indices, np.arange(recording.stop.index))

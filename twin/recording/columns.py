@@ -272,10 +272,6 @@ class StoredItems(Sequence[Item]):
         records = self._find_series(CMP_TOPIC) if kind is Comparison else self._by_kind[kind]
         return cast(tuple[R, ...], tuple(records))
 
-    def blocks(self, stream: str) -> tuple[Block, ...]:
-        """Return the blocks of a stream, in order of sample index."""
-        return cast(tuple[Block, ...], tuple(self._find_series(BLOCK_TOPICS[stream])))
-
     def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
         """Return a stream joined into one block between each pair of gaps; cached."""
         if stream not in self._contiguous:

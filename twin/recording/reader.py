@@ -82,12 +82,8 @@ class Recording:
         """Return all records of one type, in order of sample index."""
         return self.items.records_of(kind)
 
-    def blocks(self, stream: str) -> tuple[Block, ...]:
-        """Return all blocks of stream "meas" or "pred", in order of sample index."""
-        return self.items.blocks(stream)
-
     def contiguous_blocks(self, stream: str) -> tuple[Block, ...]:
-        """Return the stream joined into one block between each pair of gaps."""
+        """Return stream "meas" or "pred" joined into one block between each pair of gaps."""
         return self.items.contiguous_blocks(stream)
 
     def iter_pieces(self, stream: str) -> Iterator[Block]:
