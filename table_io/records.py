@@ -11,6 +11,7 @@ from table_io.block import Label
 from table_io.units import GRAVITY_M_S2
 
 RESPONSE_RATIOS = ("eta_d", "eta_a", "eta_r", "eta_l", "r_r", "r_l")  # of a NormalizedResponse
+MIN_JUMP_RATIO = 1.6  # of the peaks of u at neighboring steps; a smooth branch stays below
 
 
 @dataclass(frozen=True, slots=True)

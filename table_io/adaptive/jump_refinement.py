@@ -13,7 +13,6 @@ from functools import lru_cache
 from itertools import pairwise
 
 from table_io.adaptive.result import (
-    MIN_JUMP_RATIO,
     Decision,
     PolicyGenerator,
     StepRequest,
@@ -22,7 +21,7 @@ from table_io.adaptive.result import (
 )
 from table_io.config.adaptive import RefineConfig
 from table_io.config.profile import Profile
-from table_io.records import Step
+from table_io.records import MIN_JUMP_RATIO, Step
 
 # A change is smooth if it shrinks nearly in proportion to the interval.
 NARROW_WIDTH_RATIO = 1 / 7

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from table_io.adaptive.result import (
-    MIN_JUMP_RATIO,
     Decision,
     PolicyGenerator,
     StepRequest,
@@ -20,6 +19,7 @@ from table_io.adaptive.result import (
 )
 from table_io.config.adaptive import TrackConfig
 from table_io.config.profile import Profile
+from table_io.records import MIN_JUMP_RATIO
 
 PHASE_DEG = 90.0
 Points = Sequence[tuple[float, float]]  # (Hz, degrees or mm/g), newest last

@@ -8,8 +8,6 @@ from table_io.harmonics import HarmonicFit
 from table_io.records import Step
 from table_io.units import GRAVITY_M_S2
 
-MIN_JUMP_RATIO = 1.6  # of swings at neighboring steps; a smooth branch stays below
-
 
 @dataclass(frozen=True, slots=True)
 class StepResult:

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from table_io.records import NormalizedResponse, PrcPoint
+from table_io.records import MIN_JUMP_RATIO, NormalizedResponse, PrcPoint
 
 FloatND = NDArray[np.float64]
 BoolND = NDArray[np.bool_]
@@ -31,7 +31,6 @@ BoolND = NDArray[np.bool_]
 MIN_BRANCH_DIFFERENCE = 0.10  # of the larger eta: beyond it the solutions differ
 MIN_COUNTED_DIFFERENCE = 0.03  # the same, if the impact counts differ in every cycle
 MAX_REMAINING_DIFFERENCE = 0.5  # of the difference before a jump; a larger rest fades, no jump
-MIN_JUMP_RATIO = 1.6  # ratio of eta_d between neighbors that no smooth branch reaches
 
 
 @dataclass(frozen=True, slots=True)

@@ -34,8 +34,7 @@ import numpy as np
 
 from table_io.block import Block, Bool1D, Float1D
 from table_io.config.profile import Profile
-from table_io.records import Agreement, Event, PrcPoint
-from twin.compare.curves import MIN_JUMP_RATIO
+from table_io.records import MIN_JUMP_RATIO, Agreement, Event, PrcPoint
 from twin.compare.monitoring.agreement import (
     AMPLITUDE_TOLERANCE,
     GAP_ERROR_M,
