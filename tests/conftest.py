@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from twin.system.resource_limits import limit_matrix_threads
+
 # Before anything is imported that computes; so whatever does is imported where it is needed.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+limit_matrix_threads()
 # The process that reads a foreign file is forked, and what grpc does there once failed a check.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 

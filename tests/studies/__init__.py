@@ -1,5 +1,5 @@
 """Long studies of the product, each run as a module; one thread for matrices, as in a run."""
 
-import os
+from twin.system.resource_limits import limit_matrix_threads
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+limit_matrix_threads()

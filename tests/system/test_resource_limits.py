@@ -1,5 +1,6 @@
 """Too little memory or too few open files: one message that names the limit, and nothing begun."""
 
+import os
 import resource
 import subprocess
 import sys
@@ -9,7 +10,12 @@ import pytest
 
 from tests.input_errors import raises_input_error
 from twin.cli import entry
-from twin.system.resource_limits import MIN_OPEN_FILES, WANTED_OPEN_FILES, require_open_files
+from twin.system.resource_limits import (
+    MIN_OPEN_FILES,
+    WANTED_OPEN_FILES,
+    limit_matrix_threads,
+    require_open_files,
+)
 
 MAIN = "from twin.cli.entry import main; main()"
 
@@ -88,3 +94,14 @@ def test_open_files_are_raised_as_far_as_they_are_allowed(
     else:
         require_open_files()
         assert limits_set == ([] if raised_to is None else [(raised_to, limits[1])])
+
+
+@pytest.mark.parametrize(("asked", "threads"), [(None, "1"), ("4", "4")])
+def test_limit_matrix_threads_keeps_what_the_user_asks_for(
+    asked: str | None, threads: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS")
+    if asked is not None:
+        monkeypatch.setenv("OPENBLAS_NUM_THREADS", asked)
+    limit_matrix_threads()
+    assert os.environ["OPENBLAS_NUM_THREADS"] == threads

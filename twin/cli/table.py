@@ -24,10 +24,9 @@ from typer.models import CommandInfo
 from table_io.errors import InputError, suggest
 from twin.system.diagnostics import configure_logging
 from twin.system.exit_codes import EXIT_FAILED
+from twin.system.resource_limits import limit_matrix_threads
 
-# The matrices are small: BLAS threads cost more than they gain and delay the processes of a run.
-# Set before numpy is imported; child processes inherit it.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+limit_matrix_threads()  # before a command imports numpy
 
 PLAN = "Before a test"
 DRIVE = "Run a test"

@@ -1,4 +1,6 @@
-"""Limits of the system on open files and memory: raised where allowed, else one clear error."""
+"""Limits of the system on open files, memory and threads of the matrix library."""
+
+import os
 
 from table_io.errors import InputError
 
@@ -13,6 +15,15 @@ MIN_MEMORY_BYTES = 1_000_000_000  # of address space, for numpy, numba and the k
 MIN_RUN_MEMORY_BYTES = 2_000_000_000  # of each process of a live run, most of it never used
 MIN_OPEN_FILES = 128  # of each process of a live run on a machine of many cores, with observers
 WANTED_OPEN_FILES = 1024
+
+
+def limit_matrix_threads() -> None:
+    """Let numpy's matrix library use one thread, unless the user asks for more.
+
+    The matrices are small: threads cost more than they gain and delay the processes of a run. To be
+    called before numpy is imported; child processes inherit it.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def require_memory(min_bytes: int) -> None:
