@@ -213,11 +213,12 @@ def linearize_nuisances(
         signals = signals.calibrate_noise()
     bare = replace(residuals.with_signals(signals), nuisances=None)
     smooth, measured = _smooth_signals(bare, parameters), bare.motion()
-    start = signals.fuse_corrected(smooth)
+    start = smooth.fuse_motion()
     before = bare.evaluate_rows(parameters, measured)
 
     def slope(nuisance: Nuisance) -> npt.NDArray[np.float32]:
-        end = signals.fuse_corrected(correct_signals(smooth, nuisance, SLOPE_STEP))
+        # most channels stay as they are; the fusion of the smooth signals has their series
+        end = smooth.fuse_corrected(correct_signals(smooth, nuisance, SLOPE_STEP))
         # about the measured motion: only there is it known what touches what
         rows = bare.evaluate_rows(parameters, measured.move(start, end))
         return ((rows - before) / SLOPE_STEP).astype(np.float32)
