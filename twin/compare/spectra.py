@@ -1,6 +1,7 @@
 """Spectra of whole records: low-pass filtering and decimation."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
@@ -25,21 +26,21 @@ class FrequencyGrid:
     def decimation(self) -> int:
         return max(int(self.rate_hz // TARGET_RATE_HZ), 1)
 
-    @property
+    @cached_property
     def padded_size(self) -> int:
         pad = round(PAD_S * self.rate_hz)
         return self.decimation * next_fast_len(-(-(self.size + pad) // self.decimation), real=True)
 
-    @property
+    @cached_property
     def bin_count(self) -> int:
         return self.padded_size // self.decimation // 2 + 1
 
-    @property
+    @cached_property
     def omega(self) -> Float1D:
         """Angular frequencies in rad/s, (frequency,)."""
         return 2 * np.pi * rfftfreq(self.padded_size, 1.0 / self.rate_hz)[: self.bin_count]
 
-    @property
+    @cached_property
     def low_pass(self) -> Float1D:
         """Gain of the low pass, (frequency,); 1 everywhere without decimation."""
         if self.decimation == 1:
