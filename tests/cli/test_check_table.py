@@ -71,7 +71,7 @@ def failing(result: WiringCheckResult) -> list[tuple[str, str]]:
     return [(line.name, line.channel) for line in result.lines if line.verdict == "fail"]
 
 
-def test_nothing_is_moved() -> None:
+def test_check_of_the_wiring_moves_nothing() -> None:
     backend = Watched()
     result = examine(backend)
     assert result.has_passed
@@ -354,7 +354,9 @@ def test_as_json_every_line_stands_there(check: Callable[..., tuple[int, str]]) 
     assert acc["mean"] == pytest.approx(0.001, abs=1e-4)
 
 
-def test_what_is_asked_for_must_fit(check: Callable[..., tuple[int, str]]) -> None:
+def test_check_with_options_that_do_not_fit_is_refused(
+    check: Callable[..., tuple[int, str]],
+) -> None:
     quick = str(PROFILES_DIR / "tests" / "quickstart.toml")
     for words in ((), ("--json",), (quick, "--json"), (quick, "--unattended")):
         with raises_input_error(where="check", allowed="PROFILE"):
@@ -364,7 +366,7 @@ def test_what_is_asked_for_must_fit(check: Callable[..., tuple[int, str]]) -> No
     assert "ready: nothing exceeds" in check(quick)[1]  # the pre-flight is what it was
 
 
-def test_a_loss_is_no_traceback() -> None:
+def test_machine_lost_in_the_check_is_a_failed_line() -> None:
     class Lost(Watched):
         def tare(self, samples: int) -> Float2D:
             raise MachineLost("the cable is out; put it in")

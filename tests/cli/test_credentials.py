@@ -83,7 +83,7 @@ def test_a_strict_reader_takes_the_certificates_for_their_purpose_only(lab: Path
         policy.build_server_verifier(x509.DNSName("localhost")).verify(leaf, [anna])
 
 
-def test_what_the_extensions_say(lab: Path) -> None:
+def test_certificate_extensions_of_authority_and_rig(lab: Path) -> None:
     authority, rig = certificate(lab / "ca.pem"), certificate(lab / "certificate.pem")
     basic = authority.extensions.get_extension_for_class(x509.BasicConstraints)
     assert (basic.value.ca, basic.value.path_length, basic.critical) == (True, 0, True)

@@ -33,14 +33,14 @@ def test_a_hostile_file_is_refused_or_read(
     assert not any(outcome.endswith("crashed") for outcome in outcomes)
 
 
-def test_a_crash_would_be_seen(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_crash_of_a_command_is_detected(trials: Trials, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("twin.replay.verify.examine_logs", lambda paths, _: paths[7])
     code, error = call_command(("verify", trials.folder / "whole.mcap"), report=False)
     assert code == "crashed"
     assert "IndexError" in error
 
 
-def test_a_whole_file_is_none_of_these(trials: Trials, tmp_path: Path) -> None:
+def test_undamaged_files_are_accepted(trials: Trials, tmp_path: Path) -> None:
     log = trials.folder / "whole.mcap"
     assert call_command(("prc", log, "--json"), report=False)[0] == "0"
     (tmp_path / "a.csv").write_bytes(trials.table)

@@ -55,7 +55,7 @@ def test_repair_names_what_failed_first(
         repair_log(verified, new)
 
 
-def test_one_that_reads_back_as_another_is_not_left(
+def test_repaired_log_that_differs_when_read_back_is_removed(
     old: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     verified, new = examine_logs([old]), tmp_path / "new.mcap"
@@ -70,7 +70,7 @@ def test_one_that_reads_back_as_another_is_not_left(
     assert not new.exists()
 
 
-def test_what_was_there_stays(old: Path) -> None:
+def test_repair_onto_the_damaged_log_is_refused(old: Path) -> None:
     before = old.read_bytes()
     with raises_input_error(where=old):
         repair_log(examine_logs([old]), old)

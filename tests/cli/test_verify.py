@@ -232,7 +232,7 @@ def test_altered_texts_and_messages_are_seen(log: Path, recording: Recording) ->
     assert (code, report["altered"]) == (4, ["profile.toml"])
 
 
-def test_a_text_that_is_gone_is_seen(recording: Recording, tmp_path: Path) -> None:
+def test_verify_reports_a_missing_attachment(recording: Recording, tmp_path: Path) -> None:
     writer = LogWriter(tmp_path / "a.mcap", recording.start.rate_hz)
     writer.write_metadata("attachments", {"profile.toml": "0" * 64})
     for item in recording.items:

@@ -173,7 +173,7 @@ def test_one_direction_alone_has_no_hysteresis(direction: str) -> None:
     )
 
 
-def test_no_points_at_all() -> None:
+def test_detect_hysteresis_without_points() -> None:
     assert detect_hysteresis([], "measured") == ([], [])
 
 
@@ -335,11 +335,11 @@ def test_g4_has_a_left_hysteresis_at_its_secondary_resonance() -> None:
     ]
 
 
-def test_g0_has_none() -> None:
+def test_g0_has_no_hysteresis() -> None:
     assert detect_hysteresis(swept(0.0, 3.0, 7.0), "measured") == ([], [])
 
 
-def test_gm2_has_a_left_one_in_the_model() -> None:
+def test_gm2_has_a_left_hysteresis_in_the_model() -> None:
     """physics.md: SNM detaches at G-2, hysteresis 5.81 to 6.15 Hz (the rig does not)."""
     jumps, (interval,) = detect_hysteresis(swept(-0.002, 4.5, 7.5), "measured")
     assert interval.kind == "left"

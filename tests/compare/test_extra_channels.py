@@ -59,7 +59,7 @@ def test_only_what_the_model_predicts_is_selected() -> None:
     assert compared == {*COMPARED_CHANNELS, "table_disp_m", "table_acc_m_s2"}
 
 
-def test_each_is_compared_with_its_sign() -> None:
+def test_extra_channels_are_compared_with_their_sign() -> None:
     block = lab_block()
     _, comparisons = run_twins(setup(*PREDICTED), [block])
     assert comparisons[0].channels == (*COMPARED_CHANNELS, *(c.name for c in PREDICTED))

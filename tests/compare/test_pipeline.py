@@ -324,7 +324,9 @@ def test_lost_load_cells_and_accelerometer_leave_the_displacement(
         assert np.isnan([got.measured.eta_a, got.measured.r_l]).all()
 
 
-def test_a_leap_is_an_event(setup: pipeline.PipelineSetup, measured_block: Block) -> None:
+def test_jump_of_the_curve_is_an_event(
+    setup: pipeline.PipelineSetup, measured_block: Block
+) -> None:
     events = of(run_pipeline(setup, [measured_block]), Event)
     assert {event.kind for event in events} == {"jump"}
     assert "forward, 3 to 4.6 Hz: eta_d" in events[0].text

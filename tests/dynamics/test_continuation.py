@@ -182,7 +182,7 @@ def test_every_orbit_of_any_model_is_periodic_and_admissible(name) -> None:
     "parameter, limits", [("level", (0.1, 1.5)), ("mass", (300.0, 900.0)),
                           ("bumper_stiffness_r", (1e5, 1e6)), ("gap_l", (0.0005, 0.006))],
 )  # fmt: skip
-def test_any_parameter(parameter, limits) -> None:
+def test_continue_branch_over_any_parameter(parameter, limits) -> None:
     orbit = settle(model_map(), 3.4)
     branch = continue_branch(orbit, parameter, limits)
     assert {end.reason for end in branch.ends} == {"range end"}

@@ -149,7 +149,7 @@ def test_frequencies_lie_on_one_grid() -> None:
         ([0.0, 1.0], 0.05, 0.0, "not positive"),
     ],
 )
-def test_what_has_no_spectrum_is_refused(
+def test_compute_response_spectrum_refuses_invalid_input(
     record: list[float], damping: float, hz: float, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):

@@ -85,7 +85,7 @@ def test_a_rate_stands_in_for_time(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_maps_that_cannot_be(tmp_path: Path, card: str, words: list[str]) -> None:
+def test_invalid_column_map_is_refused(tmp_path: Path, card: str, words: list[str]) -> None:
     require_refused(tmp_path, words, card, t=TIME, b=wave())
 
 
@@ -226,12 +226,12 @@ def test_accelerations_are_integrated_in_the_stated_band(tmp_path: Path) -> None
     ("band", "allowed"),
     [("[0.5, 200.0]", "100 Hz"), ("[0.1, 20.0]", "1 to"), ("[9.0, 2.0]", "LOW")],
 )
-def test_bands_that_cannot_be(tmp_path: Path, band: str, allowed: str) -> None:
+def test_invalid_integration_band_is_refused(tmp_path: Path, band: str, allowed: str) -> None:
     with raises_input_error(allowed=allowed):
         import_columns(tmp_path, f"integrate_hz = {band}", time_s=TIME, mass_acc_m_s2=wave())
 
 
-def test_what_is_missing_or_lost_is_said(tmp_path: Path) -> None:
+def test_missing_and_lost_columns_are_noted(tmp_path: Path) -> None:
     samples = import_columns(
         tmp_path, time_s=TIME, rel_disp_m=wave(), force_r1_n=np.full(400, np.nan)
     )

@@ -176,14 +176,14 @@ def test_what_cannot_be_written_leaves_no_file(
     assert not list(tmp_path.iterdir())
 
 
-def test_a_file_with_what_is_no_number_is_not_played(tmp_path: Path) -> None:
+def test_drive_file_with_nan_is_refused(tmp_path: Path) -> None:
     (tmp_path / "nan.txt").write_text("0 0\n0.0005 nan\n0.001 1\n")
     with raises_input_error(where=f"--play {tmp_path / 'nan.txt'}"):
         read_drive(tmp_path / "nan.txt")
 
 
 @pytest.mark.parametrize("after", [0.0, -1.0, 0.4, float("nan")])
-def test_a_controller_cannot_play_at_once(after: float) -> None:
+def test_start_delay_below_its_minimum_is_refused(after: float) -> None:
     with raises_input_error(where=f"--after {after:g}", allowed="0.5 s"):
         serve_table(
             "follow_simulated",

@@ -167,7 +167,7 @@ def test_steps_that_were_decided_on_in_the_test_are_known(tmp_path: Path) -> Non
         (["csv", "rrd"], (), (1, 2), ["--rrd"]),
     ],
 )
-def test_what_cannot_be_exported(
+def test_invalid_export_options_are_refused_without_a_file(
     log: Path, tmp_path: Path, kinds: list[str], channels: Any, steps: Any, words: list[str]
 ) -> None:
     with pytest.raises(InputError) as caught:
@@ -302,7 +302,7 @@ def test_the_commands(log: Path, tmp_path: Path) -> None:
     )  # and lost samples, hence the 4
 
 
-def test_half_a_view_is_taken_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_incomplete_rerun_file_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     start = replace(start_record(), profile_toml=(PROFILES_DIR / "tests/g4_ss3.toml").read_text())
     write_items(tmp_path / "run.mcap", [start, *blocks()], start)
 

@@ -66,7 +66,7 @@ README = (ROOT / "README.md").read_text()
 MAX_WORDS, MAX_ANIMATION_BYTES = 620, 1_500_000
 
 
-def test_its_links_and_pictures_are_there() -> None:
+def test_links_and_pictures_of_the_readme_exist() -> None:
     targets = [target for target in re.findall(r"\]\(([^)#]+)", README) if "://" not in target]
     assert len(targets) > 15
     assert [target for target in targets if not (ROOT / target).is_file()] == []
@@ -75,12 +75,12 @@ def test_its_links_and_pictures_are_there() -> None:
     assert max(path.stat().st_size for path in pictures) < MAX_ANIMATION_BYTES
 
 
-def test_it_is_short() -> None:
+def test_readme_is_short() -> None:
     text = re.sub(r"\]\([^)]*\)|```.*?```", "", README, flags=re.DOTALL)
     assert len(re.findall(r"\w[\w.'/-]*", text)) < MAX_WORDS
 
 
-def test_its_commands_exist() -> None:
+def test_commands_of_the_readme_exist() -> None:
     names = set(re.findall(r"(?:^|`|bin/)shaketwin ([a-z]+)", README, re.MULTILINE))
     assert {"run", "check", "discover", "guide"} <= names
     assert names <= {command.name for command in COMMANDS}

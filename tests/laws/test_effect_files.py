@@ -75,7 +75,7 @@ class TestGrammar:
             "u // v", "~u", "f'{u}'", "u\nv", "",
         ],
     )  # fmt: skip
-    def test_all_else_is_refused(self, text):
+    def test_parse_expression_refuses_other_syntax(self, text):
         with pytest.raises(InputError) as caught:
             parse_expression(text, ["u", "v"])
         assert caught.value.allowed
@@ -103,7 +103,7 @@ class TestGrammar:
         ("unit", "dimension"),
         [("N s2/m2", (1, -1, 0)), ("", (0, 0, 0)), ("1/s", (0, 0, -1)), ("N/m3", (1, -2, -2))],
     )
-    def test_units(self, unit, dimension):
+    def test_parse_unit_returns_the_dimension(self, unit, dimension):
         assert parse_unit(unit) == dimension
 
     @pytest.mark.parametrize(

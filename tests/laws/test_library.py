@@ -194,7 +194,7 @@ class TestCompiled:
         return replace(effect, id="as_written", compiled={}, is_linear=False)
 
     @pytest.mark.parametrize("base", BASES[:2] + BASES[3:])
-    def test_it_moves_as_its_expression(self, effect, base):
+    def test_expression_of_an_effect_gives_the_same_motion(self, effect, base):
         written = EffectInstance.create(self.as_written(effect), typical(effect))
         expected = drive(having(effect, base=base), KICK)[1]
         out = drive(Model(base, (written,)), KICK)[1]
@@ -203,7 +203,7 @@ class TestCompiled:
         # without the law the motion is another one
         assert np.abs(drive(Model(base), KICK)[1][0] - expected[0]).max() > 1e-5 * scale[0]
 
-    def test_its_forces_along_a_motion_are_those_of_its_expression(self, effect):
+    def test_expression_of_an_effect_gives_the_same_forces(self, effect):
         out = drive(having(effect), 2.0 * noisy(2.0), StateEstimate(0, 0.0, 0.0))[1]
         u, v, _, right, left = out[:5]
         time, contact = np.arange(1, u.size + 1) / RATE_HZ, np.array([right > 0, left < 0])

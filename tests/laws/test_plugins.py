@@ -158,7 +158,7 @@ class TestInstalled:
         assert cut.tobytes() == out.tobytes()
         assert state.tobytes() == whole.tobytes()
 
-    def test_what_does_not_fit_is_refused(self):
+    def test_more_plug_in_laws_than_allowed_are_refused(self):
         model = add("zener_bumper").with_effect("slip_damper", force=1.0, yield_displacement=1e-3)
         model = model.with_effect("zener_damper", k1=1.0, tau=1.0)
         prepare_solver(model.with_effect("dragged_floor", damping=1.0), RATE_HZ)
@@ -305,7 +305,7 @@ def test_a_bumper_whose_damping_is_not_linear_recovers_without_force(force, unit
     assert np.abs(out[0] - plain[0]).max() > 1e-3 * np.abs(out[0]).max()
 
 
-def test_commands_take_it(package, tmp_path):
+def test_simulate_command_accepts_plug_in_laws(package, tmp_path):
     """`simulate` with both kinds of law, in a process that finds the installed package."""
     snm_file = read_model_text("snm")
     model = tmp_path / "model.toml"

@@ -85,7 +85,7 @@ class Signal:
         self.connections = [None] * connections
 
 
-def test_who_acquires_only_the_last_signal_is_heard() -> None:
+def test_client_of_the_last_signal_alone_is_noticed() -> None:
     device = object.__new__(OpenDaqServer)
     device._signals = [(Signal(0), None), (Signal(1), None)]
     assert device.has_client

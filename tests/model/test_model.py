@@ -129,7 +129,7 @@ def test_flat_names_and_back():
         Model.from_flat({**flat, "bouc_wem.force": 1.0})
 
 
-def test_a_card_with_sensors():
+def test_build_model_with_sensor_effects():
     text = CARD + (
         '[[effects]]\nid = "sensor_gain"\nparameters = { channel = "mass_acc_m_s2", gain = 1.1 }\n'
         '[[effects]]\nid = "sensor_lag"\nparameters = { channel = "mass_acc_m_s2", lag = 1e-3 }\n'

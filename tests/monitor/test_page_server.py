@@ -184,7 +184,7 @@ def test_page_files_need_no_other_origin(page: Served) -> None:
 
 
 @pytest.mark.parametrize("path", ["/../page_server.py", "/page/index.html", "/events/", "/%2e%2e"])
-def test_nothing_else_is_served(page: Served, path: str) -> None:
+def test_unknown_path_is_not_found(page: Served, path: str) -> None:
     assert page.get(path).status == 404
 
 

@@ -97,11 +97,11 @@ VERDICTS = {
 
 
 @pytest.mark.parametrize("key, name, want, tolerance", NUMBERS)
-def test_numbers(rows, key, name, want, tolerance):
+def test_value_of_a_paper_row_is_within_its_tolerance(rows, key, name, want, tolerance):
     assert rows[key].values[name] == pytest.approx(want, abs=tolerance)
 
 
-def test_verdicts_departures_included(rows):
+def test_verdicts_of_the_paper_rows_include_departures(rows):
     assert {key: row.verdict for key, row in rows.items()} == VERDICTS
 
 

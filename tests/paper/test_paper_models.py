@@ -32,7 +32,7 @@ def card(folder: Path, effect: str, numbers: str) -> str:
     return str(path)
 
 
-def test_who_plays_a_model() -> None:
+def test_make_simulator_is_exact_for_piecewise_linear_models() -> None:
     assert make_simulator(Model(G4)).is_exact
     assert make_simulator(Model(G4).with_effect("gap_offset", offset=2e-4)).is_exact
     assert not make_simulator(HARD).is_exact
@@ -40,7 +40,7 @@ def test_who_plays_a_model() -> None:
 
 
 @pytest.mark.parametrize("hz", [2.0, 3.4])
-def test_both_players_play_the_same_motion(hz: float) -> None:
+def test_closed_form_and_numerical_simulators_agree(hz: float) -> None:
     exact, sampled = ClosedFormSimulator(Model(G4)), NumericalSimulator(Model(G4))
     exact_sweep, other = (who.sweep([hz, hz + 0.1], AG, 30) for who in (exact, sampled))
     np.testing.assert_allclose(other.extremes, exact_sweep.extremes, rtol=5e-4, atol=1e-12)

@@ -68,7 +68,7 @@ def test_markup_in_texts_and_events_is_escaped(run_folder: Maker) -> None:
     assert "<h1>Quick &lt;i&gt;look&lt;/i&gt;</h1>" in html
 
 
-def test_what_happened_is_listed(run_folder: Maker) -> None:
+def test_report_lists_gaps_faults_and_latencies(run_folder: Maker) -> None:
     items: list[Item] = [
         *blocks(), SampleGap(100, 7, "force_l2_n", "clipped"),
         Fault(500, "twin", 500, 750, "killed"),

@@ -241,7 +241,7 @@ def test_load_cells_without_bumpers_have_nothing_to_compare(
 # Jumps and hysteresis
 
 
-def test_jumps_and_hysteresis_of_both(
+def test_summary_has_jumps_and_hysteresis_of_table_and_twin(
     recording: Recording, bundle: RunConfig, tmp_path: Path
 ) -> None:
     points = as_points([0.1, 0.2, 0.3, 0.4, 0.05], [0.1, 0.06, 0.06, 0.05, 0.05])

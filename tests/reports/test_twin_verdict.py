@@ -223,7 +223,7 @@ def test_one_step_outside_decides_and_is_the_worst(clean: Json) -> None:
     ("kind", "verdict"),
     [("disagreement", "departs"), ("unexpected jump", "agrees"), ("drift", "agrees")],
 )
-def test_warnings_that_decide(clean: Json, kind: str, verdict: str) -> None:
+def test_kind_of_a_warning_decides_the_twin_verdict(clean: Json, kind: str, verdict: str) -> None:
     warnings = [{"at_s": 1.0, "kind": kind, "text": ""}]
     judged = judge_changed(clean, warnings=warnings)
     assert (judged["verdict"], judged["warnings"]) == (verdict, 1)

@@ -100,7 +100,7 @@ def test_sizes_land_where_they_were_asked(cell: str) -> None:
     assert noisy_size(case, shares[0]) == pytest.approx(case.cell.size, rel=0.25)
 
 
-def test_the_size_of_the_case_that_was_made(generated_case: tuple[Case, CasePaths]) -> None:
+def test_generated_case_has_its_planned_size(generated_case: tuple[Case, CasePaths]) -> None:
     case, places = generated_case
     about = json.loads(places.about.read_text())
     assert about["reached"] == pytest.approx(3.0, rel=0.1)

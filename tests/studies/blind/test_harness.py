@@ -194,7 +194,9 @@ def test_no_control_is_given_a_confident_name() -> None:
     "word, confidence, fooled",
     [("named", 0.51, True), ("named", 0.5, False), ("unexplained", 0.9, False)],
 )
-def test_who_is_fooled(word: str, confidence: float, fooled: bool) -> None:
+def test_control_named_with_confidence_counts_as_fooled(
+    word: str, confidence: float, fooled: bool
+) -> None:
     effects = [{"id": "table_tilt", "confidence": confidence}]
     assert summarize_verdict({"verdict": word, "effects": effects})["fooled"] is fooled
 

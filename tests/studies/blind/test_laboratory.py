@@ -228,7 +228,7 @@ def test_what_a_verdict_names_has_a_class(
     assert row["wrong_name"] == (expected != "instrument")
 
 
-def test_clean_recordings() -> None:
+def test_score_case_of_a_clean_recording() -> None:
     healthy = score_case(verdict("none"), make_about())
     assert (healthy["healthy"], healthy["right"]) == (True, True)
     for word in ("unexplained", "ambiguous", "failed"):
@@ -385,7 +385,7 @@ def test_a_recording_without_protection_is_that_of_a_session() -> None:
     assert (ours[-1].index, ours[-1].verdict) == (theirs[-1].index, "complete")
 
 
-def test_a_case_in_a_laboratory(tmp_path: Path) -> None:
+def test_generate_case_seals_its_laboratory(tmp_path: Path) -> None:
     """Its sealed truth states the laboratory; what is shown does not; the errors are measured."""
     case = case_in("bad/none/load_sharing/1%")
     paths = generate_case(case, tmp_path)

@@ -57,7 +57,7 @@ def verdict(kind: str, *names: str, **more: Any) -> Json:
     } | more  # fmt: skip
 
 
-def test_a_right_name() -> None:
+def test_score_verdict_of_the_true_effect() -> None:
     row = score_verdict(verdict("named", "bumper_hardening"), about("single", TRUE), oracle=1.04)
     assert (row["top1"], row["exact"], row["two"], row["right"], row["region"]) == (True,) * 5
     assert row["confidence"] == 0.9
@@ -106,7 +106,7 @@ def test_what_all_sets_of_an_ambiguous_verdict_have_is_named() -> None:
     assert alone["named"] == []
 
 
-def test_none_where_nothing_is_and_where_something_is() -> None:
+def test_score_verdict_of_false_alarms_and_misses() -> None:
     assert score_verdict(verdict("none"), about("none", region=None))["false_alarm"] is False
     for kind in ("named", "ambiguous", "unexplained", "failed"):
         score = score_verdict(verdict(kind, "table_tilt"), about("none", region=None))
@@ -116,7 +116,7 @@ def test_none_where_nothing_is_and_where_something_is() -> None:
     assert (missed["top1"], missed["two"], missed["region"]) == (False, False, False)
 
 
-def test_what_is_not_in_the_library() -> None:
+def test_score_verdict_of_an_effect_outside_the_library() -> None:
     unknown = about("unknown", {**TRUE, "name": "adhesion"})
     row = score_verdict(verdict("unexplained"), unknown)
     assert (row["unexplained"], row["wrong_name"], row["region"]) == (True, False, True)
@@ -124,7 +124,7 @@ def test_what_is_not_in_the_library() -> None:
     assert (row["unexplained"], row["wrong_name"], row["right"]) == (False, True, False)
 
 
-def test_two_effects() -> None:
+def test_score_verdict_of_a_pair_counts_both_or_either() -> None:
     pair = about("pair", TRUE, OTHER)
     for names, both, either in (
         (("table_tilt", "bumper_hardening"), True, True),
@@ -195,7 +195,7 @@ def test_wilson_intervals_are_where_the_score_test_just_rejects(hits: int, count
     assert high == pytest.approx(1.0 if hits == count else brentq(test, p + 1e-12, 1.0), abs=1e-9)
 
 
-def test_nothing_counted_says_nothing() -> None:
+def test_rate_of_no_cases_is_undetermined() -> None:
     assert Rate(0, 0).interval == (0.0, 1.0)
     assert str(Rate(0, 0)) == "-"
     assert all(metric.is_reached is None for metric in compute_metrics([]))

@@ -40,7 +40,7 @@ def test_points_far_from_zero_and_near_together_are_no_trouble() -> None:
     assert fit.volts_per_unit_sd == pytest.approx(math.sqrt(2) * 1e-3, rel=1e-6)
 
 
-def test_all_alike_is_refused() -> None:
+def test_fit_calibration_refuses_equal_points() -> None:
     with pytest.raises(InputError):
         fit_calibration((1.0, 1.0), 0.0, (MeanVoltage(0.1, 1e-4), MeanVoltage(0.1, 1e-4)))
 

@@ -85,7 +85,9 @@ def test_compare_motion_takes_derivatives_by_parts(
 
 @LAW
 @given(RATES, st.floats(0.001, 0.3), SIGNS)
-def test_mismatch_of_a_gain(rate_hz: float, error: float, sign: float) -> None:
+def test_mismatch_is_proportional_to_a_gain_error(
+    rate_hz: float, error: float, sign: float
+) -> None:
     pair = make_pair(rate_hz, gain=1.0 + sign * error)
     expected = error * acceleration_of(3.0)
     assert pair.mismatch == pytest.approx(expected, rel=1e-2)

@@ -203,7 +203,7 @@ def test_offset_of_the_card_is_where_the_range_begins() -> None:
     assert not [line for line in lines(values, rig=rig) if line.verdict == "fail"]
 
 
-def test_bits_that_noise_leaves() -> None:
+def test_effective_bits_under_noise() -> None:
     resting = RestingInputs(RIG, RATE, still() * GAIN)
     assert resting.effective_bits(LASER) == pytest.approx(
         np.log2(150.0 / (np.sqrt(12) * 0.005)), abs=0.05

@@ -109,7 +109,7 @@ def test_every_table_accelerometer_may_show_the_steps_of_a_stiff_table() -> None
     assert limits[row] - elsewhere[row] == pytest.approx(limits[table] - 1e-3 * 2.0 * 9.80665)
 
 
-def test_wiring_check_knows_them() -> None:
+def test_wiring_check_covers_extra_channels() -> None:
     rig = make_lab_rig()
     backend = SimulatedBackend(rig, PROFILE.specimen, RATE_HZ, ManualClock())
     backend.open()

@@ -71,7 +71,7 @@ def both(**fault: Any) -> tuple[Float2D, Float2D]:
     return read(make_faulty_rig()), read(make_faulty_rig(({"at_s": AT, **fault},)))
 
 
-def test_every_kind_is_tried_here() -> None:
+def test_tested_faults_cover_every_kind() -> None:
     assert {fault["kind"] for fault in ALL} == set(FAULT_KINDS)
 
 

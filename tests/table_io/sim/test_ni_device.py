@@ -153,7 +153,7 @@ def test_without_regeneration_an_output_that_is_not_fed_stops_and_freezes() -> N
     assert code_of(lambda: bank.write(1000, RAMP, START_S + 1.0)) == -200290
 
 
-def test_with_regeneration_it_begins_anew() -> None:
+def test_output_with_regeneration_is_repeated() -> None:
     bank = Bank(regenerates=True)
     bank.go(RAMP)
     bank.device.advance(START_S + 1.2)
