@@ -198,18 +198,22 @@ def add_nuisances(
         mapper=mapper,
     )
     for _ in range(LINEARIZATION_COUNT):
-        with_terms = tuple(
-            linearize_nuisances(residuals, fit.parameters, calibrate=True, mapper=mapper)
-            for residuals in with_terms
-        )
-        fit = fit_with_misfit(
-            with_terms,
-            _start_nuisances(with_terms, fit.parameters.with_free(start.free)),
-            mapper=mapper,
-        )
+        with_terms, fit = _fit_nuisances(with_terms, fit.parameters.with_free(start.free), mapper)
         with_terms = tuple(learn_noise(residuals, fit.parameters) for residuals in with_terms)
     fit = fit_with_misfit(with_terms, fit.parameters, mapper=mapper)
     return with_terms, fit
+
+
+def _fit_nuisances(
+    log_residuals: Sequence[LogResiduals], parameters: ParameterSet, mapper: MapFunction
+) -> tuple[tuple[LogResiduals, ...], FitResult]:
+    """Return residuals with nuisances linear about the parameters, and the fit with them."""
+    with_terms = tuple(
+        linearize_nuisances(residuals, parameters, calibrate=True, mapper=mapper)
+        for residuals in log_residuals
+    )
+    start = _start_nuisances(with_terms, parameters)
+    return with_terms, fit_with_misfit(with_terms, start, mapper=mapper)
 
 
 def _start_nuisances(
@@ -326,20 +330,13 @@ def _linearize_about(prepared: PreparedProblem, fitted: FittedSet) -> PreparedPr
     log_residuals = tuple(replace(residuals, noise_scale={}) for residuals in problem.log_residuals)
     own = [free for free in parameters.free if not isinstance(free.key, NuisanceKey)]
     for _ in range(LINEARIZATION_COUNT):
-        log_residuals = tuple(
-            linearize_nuisances(residuals, parameters, calibrate=True, mapper=problem.mapper)
-            for residuals in log_residuals
+        log_residuals, fit = _fit_nuisances(
+            log_residuals, parameters.with_free(own), problem.mapper
         )
-        start = _start_nuisances(log_residuals, parameters.with_free(own))
-        fit = fit_with_misfit(log_residuals, start, mapper=problem.mapper)
         parameters = fit.parameters
-    base = fitted.remove_from(fit.parameters)
-    log_residuals = tuple(
-        learn_noise(residuals, fit.parameters, base) for residuals in log_residuals
-    )
-    first = fit_with_misfit(
-        log_residuals, fitted.remove_from(fit.parameters), mapper=problem.mapper
-    )
+    base = fitted.remove_from(parameters)
+    log_residuals = tuple(learn_noise(residuals, parameters, base) for residuals in log_residuals)
+    first = fit_with_misfit(log_residuals, base, mapper=problem.mapper)
     return replace(prepared, problem=replace(problem, log_residuals=log_residuals), first_fit=first)
 
 
