@@ -210,6 +210,24 @@ def test_without_a_rest_a_laser_may_have_any_zero() -> None:
     assert fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.01)
 
 
+def test_a_zero_that_drifts_is_as_large_as_it_shows_in_flight_and_on_average() -> None:
+    """Load cells by 10 N and accelerometers by 0.05 m/s2 over the record; they hide nothing."""
+    quiet = log()
+    ramp = np.linspace(0.0, 1.0, quiet.signals.time_s.size)
+    spectra = dict(quiet.signals.spectra)
+    drifts = dict.fromkeys((*RIGHT_CELLS, *LEFT_CELLS), 10.0) | {"mass_acc_m_s2": 0.05}
+    for channel, drift in drifts.items():
+        spectra[channel] = spectra[channel] + quiet.signals.grid.from_time_domain(drift * ramp)
+    drifting = replace(quiet.signals, spectra=spectra)
+    sizes = {(each.kind, each.place): each.size for each in list_nuisances(drifting)}
+    for channel, drift in drifts.items():
+        for kind in ("offset", "offset1"):  # a ramp is half its end, and half of it up and down
+            assert sizes[kind, channel] == pytest.approx(0.5 * drift, rel=0.1)
+    verdict = discover_effects([replace(quiet, signals=drifting)], SNM).verdict
+    assert verdict.outcome == "none"
+    assert verdict.best.fit.values[STIFFNESS] == pytest.approx(TRUE.stiffness, rel=0.01)
+
+
 def test_what_nothing_contradicts_is_no_nuisance() -> None:
     """The scales of all displacements and of all forces are fixed."""
     nuisances = list_nuisances(log().signals)

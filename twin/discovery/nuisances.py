@@ -22,8 +22,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 from numpy.polynomial import Chebyshev
+from numpy.polynomial.legendre import legvander
 
-from table_io.block import Bool2D
+from table_io.block import Bool2D, Float1D, Float2D, Label
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from twin.compare.spectra import Spectrum
 from twin.discovery.least_squares import FitResult, MapFunction
@@ -38,12 +39,13 @@ from twin.discovery.parameters import (
 )
 from twin.discovery.residuals import LogResiduals, Nuisance, NuisanceTerms
 from twin.discovery.signals import SENSOR_PAIRS, LogSignals, pass_motion, weigh_sensors
+from twin.discovery.starting_values import solve_columns
 
 ACCELEROMETERS = ("mass_acc_m_s2", "table_acc_m_s2")
 LASERS = ("rel_disp_m", "mass_disp_m", "table_disp_m")
 SIDES = {"right": RIGHT_CELLS, "left": LEFT_CELLS}
 LINEARITY_DEGREES = range(2, 8)
-SLOW_TERMS = 2  # cosines over the length of the record, besides the constant offset
+SLOW_TERMS = 2  # degree of a drift over the length of the record
 # Typical sizes (one standard deviation).
 TYPICAL_GAIN = 0.005  # calibration and temperature
 TYPICAL_LAG_S = 5e-4  # multiplexed channels, different anti-alias filters
@@ -87,7 +89,6 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     paired = {cell for cells in pairs.values() for cell in cells}
     # The gains of two cells are that of their sum, and their shares.
     scaled = [channel for channel in checkable if channel not in paired] + [*pairs]
-    is_component = "damper_force_n" in channels
     nuisances = [Nuisance("gain", place, TYPICAL_GAIN) for place in scaled]
     nuisances += [Nuisance("lag", channel, TYPICAL_LAG_S, "s") for channel in checkable]
     nuisances += [
@@ -100,14 +101,10 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
         if channel in ACCELEROMETERS
     ]
     for channel in channels:
-        share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
-        size, unit = share * signals.channel_rms(channel), CHANNEL_BY_NAME[channel].unit
-        # Without a rest the zero of a motion may be anywhere; that of a cell shows in flight.
-        is_open = channel in (*LASERS, *ACCELEROMETERS) and channel not in signals.rest_values
-        mean = signals.channel_mean(channel) if is_open and not is_component else 0.0
-        nuisances.append(Nuisance("offset", channel, max(size, abs(mean)), unit))
+        unit = CHANNEL_BY_NAME[channel].unit
         nuisances += [
-            Nuisance(f"offset{term}", channel, size, unit) for term in range(1, SLOW_TERMS + 1)
+            Nuisance("offset" + (str(term) if term else ""), channel, size, unit)
+            for term, size in enumerate(_size_offsets(signals, channel))
         ]
     for channel in channels:
         if channel in LASERS:
@@ -127,6 +124,47 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     if any(math.isfinite(gap) for gap in signals.gaps_m):
         nuisances.append(Nuisance("gap", "", TYPICAL_GAP_M, "m"))
     return tuple(nuisances)
+
+
+def _size_offsets(signals: LogSignals, channel: str) -> Float1D:
+    """Return the typical sizes of the slow terms of the zero of a channel, (term,).
+
+    A zero that drifts by more than is usual shows where the true value is known.
+    """
+    share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
+    sizes = np.full(SLOW_TERMS + 1, share * signals.channel_rms(channel))
+    known = 1 if channel in LASERS else sizes.size
+    readings = signals.grid.to_time_domain(signals.spectra[channel])
+    at_zero = _find_zero(signals, channel)
+    terms = solve_columns(_list_slow_terms(signals)[:known, at_zero], readings[at_zero])
+    if terms is not None:
+        sizes[:known] = np.maximum(sizes[:known], np.abs(terms))
+    return sizes
+
+
+def _find_zero(signals: LogSignals, channel: str) -> Bool2D:
+    """Return where the true value of a channel is zero, or is on average, (sample,).
+
+    An acceleration is on average; so is, beside bumpers, a motion without a rest, which may have
+    any zero. A load cell is while the mass is on the other side.
+    """
+    moving = signals.label != Label.REST
+    if channel in ACCELEROMETERS:
+        return moving
+    if channel in LASERS:
+        is_open = channel not in signals.rest_values and "damper_force_n" not in signals.channels
+        return moving & is_open
+    u = signals.grid.to_time_domain(signals.relative_spectrum)
+    for cells, sign, gap in zip(SIDES.values(), (1.0, -1.0), signals.gaps_m, strict=True):
+        if channel in cells and gap > 0:
+            return moving & (sign * u < 0)
+    return np.zeros_like(moving)
+
+
+def _list_slow_terms(signals: LogSignals) -> Float2D:
+    """Return Legendre polynomials of time, (term, sample); the first is constant."""
+    time = np.linspace(-1.0, 1.0, signals.time_s.size)
+    return np.asarray(legvander(time, SLOW_TERMS).T)
 
 
 def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSignals:
@@ -161,8 +199,8 @@ def correct_signals(signals: LogSignals, nuisance: Nuisance, z: float) -> LogSig
             corrected = spectrum - signals.grid.from_time_domain(error)
         case _:  # offset, offset1, ...
             term = int(nuisance.kind.removeprefix("offset") or 0)
-            phase = np.pi * term * np.arange(signals.time_s.size) / signals.time_s.size
-            corrected = spectrum - signals.grid.from_time_domain(amount * np.cos(phase))
+            drift = amount * _list_slow_terms(signals)[term]
+            corrected = spectrum - signals.grid.from_time_domain(drift)
     return _with_spectra(signals, {place: corrected})
 
 

@@ -148,11 +148,6 @@ class LogSignals:
         values = self._values_in_motion(channel)
         return float(values.std()) if values.size else 0.0
 
-    def channel_mean(self, channel: str) -> float:
-        """Return the mean of a channel while the drive moves, SI."""
-        values = self._values_in_motion(channel)
-        return float(values.mean()) if values.size else 0.0
-
     def _values_in_motion(self, channel: str) -> Float1D:
         return self.grid.to_time_domain(self.spectra[channel])[self.label != Label.REST]
 
