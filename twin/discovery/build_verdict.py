@@ -197,19 +197,19 @@ def _list_excluded_sizes(discovery: Discovery) -> list[ExcludedSize]:
 
 
 def _list_nuisances(discovery: Discovery) -> list[FittedNuisance]:
-    """Return the fitted nuisances that exceed their typical size, the largest first."""
+    """Return the fitted nuisances that exceed their usual size, the largest first."""
     values = discovery.verdict.best.fit.parameters
-    fitted = []
-    for residuals in discovery.prepared.problem.log_residuals:
-        fitted += [
-            FittedNuisance(
-                log=residuals.signals.name, kind=nuisance.kind, place=nuisance.place,
-                value=z * nuisance.size, unit=nuisance.unit, typical=abs(z),
-            )
-            for nuisance, z in list_sizes(residuals, values)
-            if abs(z) > 1.0
-        ]  # fmt: skip
-    return sorted(fitted, key=lambda nuisance: -nuisance.typical)
+    fitted = [
+        FittedNuisance(
+            log=residuals.signals.name, kind=nuisance.kind, place=nuisance.place,
+            value=z * nuisance.size, unit=nuisance.unit,
+            typical=abs(z) * nuisance.size / (nuisance.usual or nuisance.size),
+        )
+        for residuals in discovery.prepared.problem.log_residuals
+        for nuisance, z in list_sizes(residuals, values)
+    ]  # fmt: skip
+    large = [nuisance for nuisance in fitted if nuisance.typical > 1.0]
+    return sorted(large, key=lambda nuisance: -nuisance.typical)
 
 
 def _judge_held_out(
@@ -258,18 +258,12 @@ def build_sensors(checks: Sequence[SensorCheck]) -> Sensors:
     """Return the verdict on the instruments."""
     rows = [
         SensorCheckResult(
-            log=check.log,
-            kind=check.kind,
-            channels=[*check.channels],
-            value=check.value,
-            low=check.low,
-            high=check.high,
-            unit=check.unit,
-            limit=check.limit,
-            healthy=check.is_healthy,
+            log=check.log, kind=check.kind, channels=[*check.channels],
+            value=check.value, low=check.low, high=check.high, unit=check.unit,
+            limit=check.limit, healthy=check.is_healthy,
         )
         for check in checks
-    ]
+    ]  # fmt: skip
     is_healthy = all(check.is_healthy for check in checks)
     return Sensors(state="healthy" if is_healthy else "to be mended", checks=rows)
 

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from numpy.polynomial import Chebyshev
 from numpy.polynomial.legendre import legvander
 
-from table_io.block import Bool2D, Float1D, Float2D, Label
+from table_io.block import Bool2D, Float2D, Label
 from table_io.channels import CHANNEL_BY_NAME, LEFT_CELLS, RIGHT_CELLS
 from twin.compare.spectra import Spectrum
 from twin.discovery.least_squares import FitResult, MapFunction
@@ -101,11 +101,7 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
         if channel in ACCELEROMETERS
     ]
     for channel in channels:
-        unit = CHANNEL_BY_NAME[channel].unit
-        nuisances += [
-            Nuisance("offset" + (str(term) if term else ""), channel, size, unit)
-            for term, size in enumerate(_size_offsets(signals, channel))
-        ]
+        nuisances += _list_offsets(signals, channel)
     for channel in channels:
         if channel in LASERS:
             nuisances += [
@@ -126,20 +122,22 @@ def list_nuisances(signals: LogSignals) -> tuple[Nuisance, ...]:
     return tuple(nuisances)
 
 
-def _size_offsets(signals: LogSignals, channel: str) -> Float1D:
-    """Return the typical sizes of the slow terms of the zero of a channel, (term,).
-
-    A zero that drifts by more than is usual shows where the true value is known.
-    """
+def _list_offsets(signals: LogSignals, channel: str) -> list[Nuisance]:
+    """Return the slow terms of the zero of a channel, with their size where they show it."""
     share = TYPICAL_LASER_OFFSET if channel in LASERS else TYPICAL_OFFSET
-    sizes = np.full(SLOW_TERMS + 1, share * signals.channel_rms(channel))
-    known = 1 if channel in LASERS else sizes.size
+    usual = share * signals.channel_rms(channel)
     readings = signals.grid.to_time_domain(signals.spectra[channel])
     at_zero = _find_zero(signals, channel)
-    terms = solve_columns(_list_slow_terms(signals)[:known, at_zero], readings[at_zero])
-    if terms is not None:
-        sizes[:known] = np.maximum(sizes[:known], np.abs(terms))
-    return sizes
+    terms = _list_slow_terms(signals)[: 1 if channel in LASERS else None, at_zero]
+    shown = solve_columns(terms, readings[at_zero])
+    sizes = np.full(SLOW_TERMS + 1, usual)
+    if shown is not None:
+        sizes[: shown.size] = np.maximum(usual, np.abs(shown))
+    unit = CHANNEL_BY_NAME[channel].unit
+    return [
+        Nuisance("offset" + (str(term) if term else ""), channel, float(size), unit, usual)
+        for term, size in enumerate(sizes)
+    ]
 
 
 def _find_zero(signals: LogSignals, channel: str) -> Bool2D:

@@ -59,12 +59,16 @@ MAX_SAMPLES = 120_000  # moving samples of all logs together; limits time and me
 
 @dataclass(frozen=True, slots=True)
 class Nuisance:
-    """Nuisance of a log: kind and place (channel or side), and typical size in its SI unit."""
+    """Nuisance of a log: kind and place (channel or side), and typical size in its SI unit.
+
+    `usual` is that of an ordinary laboratory, where the log itself shows another one.
+    """
 
     kind: str
     place: str
     size: float
     unit: str = ""
+    usual: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
