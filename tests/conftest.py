@@ -17,6 +17,10 @@ limit_matrix_threads()
 # The process that reads a foreign file is forked, and what grpc does there once failed a check.
 os.environ.setdefault("GRPC_ENABLE_FORK_SUPPORT", "0")
 
+# What is imported is compiled once for all the processes that the tests start.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # Drawing was a fifth of the time of all tests. So every line is drawn, but coarsely and without
 # ticks, here and in the processes that tests start. `full_quality` is for tests of the pictures.
 DRAFT_SITE = Path(__file__).parent / "draft"
