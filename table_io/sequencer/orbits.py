@@ -385,6 +385,19 @@ def decide_orbit(state: SequencerState) -> SequencerState:
                 return _begin_releases(replace(state, search=search), point, motion)
         state = replace(state, search=search, records=(*state.records, point))
         return _next_orbit(state)
+    return _correct_orbit(replace(state, search=search), measured, nominal)
+
+
+def _correct_orbit(
+    state: SequencerState, measured: OrbitMeasurement, nominal: complex
+) -> SequencerState:
+    """Correct reference and level of an orbit, and approach it again.
+
+    `nominal` is the fundamental of the table's acceleration in m/s2 without the feedback.
+    """
+    search, plan = _search(state), _config(state).orbit_plan
+    target, level_m_s2 = search.target, plan.points[search.target.position].acceleration_m_s2
+    level_ratio = abs(nominal) / level_m_s2
     factor = min(max(1.0 / level_ratio, 1.0 / MAX_LEVEL_FACTOR), MAX_LEVEL_FACTOR)
     # no more than the command can change
     sine = _correct_sine(state, target.frequency_hz, level_m_s2, search.level_factor * factor)
