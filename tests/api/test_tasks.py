@@ -4,6 +4,7 @@ import ast
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from tests.command_line import call_main
 from tests.sweeps.small_study import STUDY, read_stored_bytes, write_study
 from twin import api
 from twin.cli.table import COMMANDS
+from twin.discovery.task import FittedModel
 from twin.results.contract import format_json
 from twin.system.files import hash_file
 
@@ -122,9 +124,15 @@ def compare_exports(log: Path, folder: Path) -> tuple[object, object]:
     return (folder / "python.csv").read_text(), (folder / "shell.csv").read_text()
 
 
+@cache
+def identify_once(log: Path) -> FittedModel:
+    """Return what is identified from a recording, which takes seconds."""
+    return api.identify([log])
+
+
 def compare_fits(log: Path, folder: Path) -> tuple[object, object]:
     assert call_main("identify", log, "--out", folder / "shell.toml").returncode == 0
-    fitted = api.identify([log])
+    fitted = identify_once(log)
     fitted.save_model(folder / "python.toml")
     report = json.loads(fitted.report.to_json()) | {"seconds": 0}
     written = read_json(folder / "shell" / "identify.json")
@@ -262,7 +270,7 @@ def test_a_task_returns_what_its_command_writes(
 
 
 def test_an_identified_model_states_its_recordings(log_file: Path) -> None:
-    fitted = api.identify([log_file])
+    fitted = identify_once(log_file)
     log = api.open_log(log_file)
     source = f'sha256 = "{hash_file(log_file)}"'
     assert source in fitted.model_toml
